@@ -1,4 +1,4 @@
-//! Lists the shaders, so that a new one is a new file: `shaders/*.wgsl` are stages, `shaders/shared/*.wgsl`
+//! Lists the shaders, so that a new one is a new file: `shaders/*.wgsl` are kernels, `shaders/shared/*.wgsl`
 //! are imports.
 
 use std::error::Error;

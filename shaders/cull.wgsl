@@ -14,7 +14,7 @@
 @group(0) @binding(2) var<storage, read> transforms: array<vec4<f32>>;
 @group(0) @binding(3) var<storage, read> chunk_seen: array<u32>;
 // z: smoothing; frozen blocks have a single row of zeros.
-@group(0) @binding(5) var<storage, read> refine: array<vec4<f32>>;
+@group(0) @binding(5) var<storage, read> density_sums: array<vec4<f32>>;
 @group(0) @binding(4) var<storage, read_write> flags: array<u32>;
 
 fn may_be_seen(i: u32) -> bool {
@@ -26,7 +26,7 @@ fn may_be_seen(i: u32) -> bool {
     let norm2 = dot(quat, quat);
     var max_scale = exp(max(log_scale.x, max(log_scale.y, log_scale.z)));
     if veiled(frame.mip_filter, arrayLength(&flags)) != 0u {
-        max_scale = length(vec2<f32>(max_scale, refine[min(i, arrayLength(&refine) - 1u)].z));
+        max_scale = length(vec2<f32>(max_scale, density_sums[min(i, arrayLength(&density_sums) - 1u)].z));
     }
     let finite = is_finite(m.x) && is_finite(m.y) && is_finite(m.z) && is_finite(norm2) && is_finite(max_scale)
         && is_finite(log_scale.x) && is_finite(log_scale.y) && is_finite(log_scale.z) && is_finite(mean_opacity.w);

@@ -11,8 +11,8 @@
 // Adam (adam.wgsl, moments_*.wgsl) with the number of its own steps. Gaussians that no pixel could see are
 // not touched. Where Adam acts on all Gaussians in every iteration (3DGS), the second moment of one that a
 // share p of the views sees averages zeros too, so its steps are 1 / sqrt(p) larger for each view that sees
-// it; so are they here (`haste`), with p the share of the trainable Gaussians that this view sees, but for
-// scales and the higher bands. Under water the constant colour has a haste of its own (water.wgsl). A
+// it; so are they here (`lr_scale`), with p the share of the trainable Gaussians that this view sees, but for
+// scales and the higher bands. Under water the constant colour has a scale of its own (water.wgsl). A
 // Gaussian without any gradient in this view is not touched either. On top, per visit: weights on opacity and
 // scale and noise on the means, as 3DGS-MCMC (Kheradmand et al. 2024) has them for every Gaussian in every
 // iteration; the weights are divided by the number of visible ones. Under water there is one more, on the
@@ -54,11 +54,11 @@ struct Step {
 @group(0) @binding(4) var<storage, read> flags: array<u32>;
 @group(0) @binding(8) var<storage, read_write> transforms: array<vec4<f32>>;
 @group(0) @binding(9) var<storage, read_write> sh_coeffs: array<vec4<f32>>;
-@group(0) @binding(13) var<storage, read_write> refine: array<vec4<f32>>;
+@group(0) @binding(13) var<storage, read_write> density_sums: array<vec4<f32>>;
 @group(0) @binding(15) var<uniform> water: Water;
 
 // Largest factor on the rates of a view that sees little of the model.
-const MOST_HASTE: f32 = 8.0;
+const MAX_LR_SCALE: f32 = 8.0;
 
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
@@ -88,7 +88,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let bare_scales = exp(t2.xyz);
     var scales = bare_scales;
     // Of density control and smoothing; see the end.
-    let seen = refine[i];
+    let seen = density_sums[i];
     // Deviations before over after the 3D filter of Mip-Splatting.
     var shares = vec3<f32>(1.0);
     if seen.z > 0.0 {
@@ -200,12 +200,12 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     // air. Not the higher bands: they would take what a noisy photograph has for what its direction shows,
     // several times over. Their rate is another one only in clear water (water.clear_harmonics), where
     // step.sh_rest_lr has that.
-    var colour_haste = vec3<f32>(1.0);
+    var colour_lr_scale = vec3<f32>(1.0);
     let medium = veiled(frame.medium, arrayLength(&flags) + 6u);
     if medium != MEDIUM_NONE {
         let clear = max(rgb, vec3<f32>(0.0));
         let through = exp(-water.beta_d * distance);
-        colour_haste = haste_under_water(water, clear, distance);
+        colour_lr_scale = lr_scale_under_water(water, clear, distance);
         if medium != MEDIUM_DECODED && medium < MEDIUM_AS_SHOWN {
             v_blended = by_light(medium, water, clear, distance, v_blended);
             let veil_slope = water.b_inf * water.beta_b * exp(-water.beta_b * distance);
@@ -221,7 +221,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
 
     // Adam's state: number of steps of this Gaussian.
     let count = bitcast<u32>(t2.w) + 1u;
-    var haste = 1.0;
+    var lr_scale = 1.0;
     let trainable = veiled(step.trainable, arrayLength(&flags));
     if trainable > 0u {
         // Trainable Gaussians come first, so this is how many of them the view sees.
@@ -229,14 +229,14 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         if trainable < frame.gaussians {
             seen_count = flags[trainable];
         }
-        haste = min(sqrt(f32(trainable) / f32(max(seen_count, 1u))), MOST_HASTE);
+        lr_scale = min(sqrt(f32(trainable) / f32(max(seen_count, 1u))), MAX_LR_SCALE);
     }
     let pace = pace_of(count);
     // Not for scales and the higher bands: their rates are as large as a step may be
     // (core/twins/src/adam.rs).
-    let rates = vec4<f32>(haste, haste, 1.0, haste)
+    let rates = vec4<f32>(lr_scale, lr_scale, 1.0, lr_scale)
         * vec4<f32>(step.means_lr, step.quats_lr, step.scales_lr, step.opacity_lr);
-    let sh_rates = vec2<f32>(haste, 1.0) * vec2<f32>(step.sh_dc_lr, step.sh_rest_lr);
+    let sh_rates = vec2<f32>(lr_scale, 1.0) * vec2<f32>(step.sh_dc_lr, step.sh_rest_lr);
     begin_colour(i, v_rgb, greatest_of(basis_values), pace);
     var weights = Basis(vec4<f32>(0.0), vec4<f32>(0.0), vec4<f32>(0.0), vec4<f32>(0.0));
     for (var g = 0u; g < coefficient_count; g++) {
@@ -252,7 +252,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
                 gradient = vec4<f32>(k.x * v_rgb, k.y * v_rgb.x);
                 let own = vec4<f32>(dot(value.xyz, v_rgb), value.w * v_rgb.x, 0.0, 0.0);
                 add_weights(&weights, g, own);
-                if dc { rate = vec4<f32>(sh_rates.x * colour_haste, sh_rates.y); }
+                if dc { rate = vec4<f32>(sh_rates.x * colour_lr_scale, sh_rates.y); }
             } else if part == 1u {
                 gradient = vec4<f32>(k.y * v_rgb.yz, k.z * v_rgb.xy);
                 add_weights(&weights, g, vec4<f32>(0.0, dot(value.xy, v_rgb.yz), dot(value.zw, v_rgb.xy), 0.0));
@@ -286,7 +286,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     var new0 = t0 - transform_step(i, 0u, vec4<f32>(v_mean, v_logit), rates.xxxw, pace);
     let new1 = t1 - transform_step(i, 1u, v_quat, rates.yyyy, pace);
     let new2 = t2.xyz - transform_step(i, 2u, vec4<f32>(v_log_scale, 0.0), rates.zzzz, pace).xyz;
-    if haste * step.mean_noise > 0.0 {
+    if lr_scale * step.mean_noise > 0.0 {
         // Noise of the shape of the Gaussian, for those that are nearly transparent (gate of 3DGS-MCMC, eq.
         // 8).
         let gate = 1.0 / (1.0 + exp(-100.0 * (0.005 - opacity)));
@@ -299,7 +299,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         // Deviations times a standard normal. The reference code of the paper multiplies by the covariance,
         // whose unit is an area: in a scene in metres it throws Gaussians of half a metre across hundreds.
         let shaped = rot * (bare_scales * normal);
-        let moved = new0.xyz + (gate * haste * step.mean_noise) * shaped;
+        let moved = new0.xyz + (gate * lr_scale * step.mean_noise) * shaped;
         new0 = vec4<f32>(moved, new0.w);
     }
     transforms[3u * i] = new0;
@@ -309,7 +309,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     // gradient by the centre in units of half a picture: that of 3DGS, whose pixel coordinates run from -1
     // to 1.
     let by_centre = length(0.5 * vec2<f32>(frame.size) * g0.xy);
-    refine[i] = vec4<f32>(seen.x + g1.w, seen.y + 1.0, seen.z, seen.w + by_centre);
+    density_sums[i] = vec4<f32>(seen.x + g1.w, seen.y + 1.0, seen.z, seen.w + by_centre);
 }
 
 fn add_weights(weights: ptr<function, Basis>, g: u32, own: vec4<f32>) {

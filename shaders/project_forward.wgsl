@@ -22,7 +22,7 @@
 @group(0) @binding(8) var<storage, read_write> order: array<u32>;
 @group(0) @binding(9) var<storage, read_write> gaussian_from_visible: array<u32>;
 // z: smoothing; frozen blocks have a single row of zeros.
-@group(0) @binding(10) var<storage, read> refine: array<vec4<f32>>;
+@group(0) @binding(10) var<storage, read> density_sums: array<vec4<f32>>;
 @group(0) @binding(11) var<uniform> water: Water;
 
 @compute @workgroup_size(64)
@@ -47,7 +47,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     var opacity = sigmoid(mean_opacity.w);
     let filtered = veiled(frame.mip_filter, arrayLength(&flags)) != 0u;
     if filtered {
-        let smoothing = refine[min(i, arrayLength(&refine) - 1u)].z;
+        let smoothing = density_sums[min(i, arrayLength(&density_sums) - 1u)].z;
         if smoothing > 0.0 {
             let wide = widened(scales, smoothing);
             let shares = scales / wide;

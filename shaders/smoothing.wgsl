@@ -7,7 +7,7 @@
 // variance of the filter is 0.2 / (greatest rate)^2; a Gaussian that no view samples is not smoothed.
 //   views  [V*5] vec4: rows of world to camera (rotation xyz, translation w), (focal xy, principal xy), (size
 //          xy, 0, 0)
-//   refine [N]   vec4: deviation of the filter in z, scene units
+//   density_sums [N]   vec4: deviation of the filter in z, scene units
 // One thread a Gaussian.
 
 // The value of the paper.
@@ -16,7 +16,7 @@ const VARIANCE: f32 = 0.2;
 @group(0) @binding(0) var<uniform> block: Block;
 @group(0) @binding(1) var<storage, read> transforms: array<vec4<f32>>;
 @group(0) @binding(2) var<storage, read> views: array<vec4<f32>>;
-@group(0) @binding(3) var<storage, read_write> refine: array<vec4<f32>>;
+@group(0) @binding(3) var<storage, read_write> density_sums: array<vec4<f32>>;
 
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
@@ -36,5 +36,5 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
             rate = max(rate, max(lens.x, lens.y) / m.z);
         }
     }
-    refine[i].z = select(0.0, sqrt(VARIANCE) / rate, rate > 0.0);
+    density_sums[i].z = select(0.0, sqrt(VARIANCE) / rate, rate > 0.0);
 }

@@ -14,7 +14,7 @@ use fathom_proto::admin::v1::{
     ListTenantsRequest, ListTokensRequest, ListWorkersRequest, RevokeTokenRequest, SetQuotaRequest, Tenant,
     Token, UncordonWorkerRequest, Worker,
 };
-use fathom_proto::dial::{Dial, DialError, Line, cause, reason};
+use fathom_proto::dial::{Connection, Dial, DialError, cause, reason};
 use fathom_proto::v1::job_service_client::JobServiceClient;
 use fathom_proto::v1::upload_service_client::UploadServiceClient;
 use fathom_proto::v1::{
@@ -34,9 +34,9 @@ use crate::progress::{Progress, Unit};
 pub struct Client {
     pub url: String,
     dial: Dial,
-    pub jobs: JobServiceClient<Line>,
-    pub uploads: UploadServiceClient<Line>,
-    pub admin: AdminServiceClient<Line>,
+    pub jobs: JobServiceClient<Connection>,
+    pub uploads: UploadServiceClient<Connection>,
+    pub admin: AdminServiceClient<Connection>,
 }
 
 /// A lost connection is retried for about a minute; a coordinator restarts within seconds.

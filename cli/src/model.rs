@@ -2,8 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
+use fathom_core::axes;
 use fathom_core::config::DataConfig;
-use fathom_core::frame;
 use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::{AdapterSummary, Gpu, GpuOptions, adapters};
 use fathom_core::ply;
@@ -86,8 +86,8 @@ pub const LINEAR_COLOURS: &str = "colours are in linear light, their harmonics r
 pub fn load(path: &Path) -> Result<Gaussians> {
     refuse_linear(path)?;
     let model = ply::read_model(path)?;
-    Ok(match frame::among(ply::SplatReader::open(path)?.comments())? {
-        Some(to_model) => frame::turned(model, to_model.inverse()),
+    Ok(match axes::among(ply::SplatReader::open(path)?.comments())? {
+        Some(to_model) => axes::turned(model, to_model.inverse()),
         None => model,
     })
 }

@@ -19,7 +19,7 @@ use fathom_coordinator::schedule::{
 use fathom_coordinator::store::{Claim, JobStore, NewJob, SledOptions, SledStore};
 use fathom_coordinator::{CoordinatorConfig, serve};
 use fathom_core::scene::BlobRef;
-use fathom_proto::dial::{Dial, Line};
+use fathom_proto::dial::{Connection, Dial};
 use fathom_proto::v1::{Progress, Stage as SentKind};
 use fathom_proto::worker::v1;
 use fathom_proto::worker::v1::worker_service_client::WorkerServiceClient;
@@ -184,7 +184,8 @@ async fn claims(store: &Arc<SledStore>, job: &JobId, count: usize) -> Result<(),
 
 /// Workers that each renew a lease.
 async fn heartbeats(url: &str, workers: usize, waiting: usize, seconds: u64) -> Result<(), Failure> {
-    let lines: Vec<Line> = (0..CONNECTIONS).map(|_| Dial::to(url).lazily()).collect::<Result<_, _>>()?;
+    let lines: Vec<Connection> =
+        (0..CONNECTIONS).map(|_| Dial::to(url).lazily()).collect::<Result<_, _>>()?;
     let renewals = Arc::new(AtomicU64::new(0));
     let begin = Instant::now();
     let mut living = Vec::new();
@@ -250,7 +251,7 @@ async fn heartbeats(url: &str, workers: usize, waiting: usize, seconds: u64) -> 
 }
 
 /// A worker that waits for a stage without tasks.
-async fn wait(mut client: WorkerServiceClient<Line>, number: usize) -> Result<(), Failure> {
+async fn wait(mut client: WorkerServiceClient<Connection>, number: usize) -> Result<(), Failure> {
     register(&mut client, number, SentKind::Borders).await?;
     for call in 0.. {
         let request_id = format!("{} {call}", name_of(number));
@@ -271,7 +272,7 @@ fn name_of(number: usize) -> String {
     format!("worker {number}")
 }
 
-async fn join(client: &mut WorkerServiceClient<Line>, number: usize) -> Result<v1::Lease, Failure> {
+async fn join(client: &mut WorkerServiceClient<Connection>, number: usize) -> Result<v1::Lease, Failure> {
     register(client, number, SentKind::Partition).await?;
     let claim = v1::ClaimRequest {
         incarnation: incarnation_of(number),
@@ -283,7 +284,7 @@ async fn join(client: &mut WorkerServiceClient<Line>, number: usize) -> Result<v
 }
 
 async fn register(
-    client: &mut WorkerServiceClient<Line>,
+    client: &mut WorkerServiceClient<Connection>,
     number: usize,
     kind: SentKind,
 ) -> Result<(), Failure> {

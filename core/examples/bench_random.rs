@@ -17,7 +17,7 @@ use std::time::Instant;
 
 use fathom_core::config::Moments;
 use fathom_core::gpu::{
-    Blocks, Frame, FrameUniform, Gpu, GpuOptions, Recorder, StageTime, StepUniform, Workload, sh_stride,
+    Blocks, Frame, FrameUniform, Gpu, GpuOptions, KernelTime, Recorder, StepUniform, Workload, sh_stride,
 };
 use fathom_core::train::{BackwardBuffers, record_backward};
 use serde_json::{Value, json};
@@ -221,18 +221,24 @@ impl Step {
 }
 
 /// Times of one stage of a pass in every repetition.
-struct StageTimes {
+struct KernelTimes {
     pass: Pass,
-    stage: &'static str,
+    kernel: &'static str,
     dispatches: u32,
     seconds: Vec<f64>,
     cpu_seconds: Vec<f64>,
 }
 
-fn collect(all: &mut Vec<StageTimes>, pass: Pass, times: Vec<StageTime>, by_cpu: bool) {
-    for StageTime { stage, seconds, dispatches } in times {
-        let at = all.iter().position(|have| have.pass == pass && have.stage == stage).unwrap_or_else(|| {
-            all.push(StageTimes { pass, stage, dispatches, seconds: Vec::new(), cpu_seconds: Vec::new() });
+fn collect(all: &mut Vec<KernelTimes>, pass: Pass, times: Vec<KernelTime>, by_cpu: bool) {
+    for KernelTime { kernel: stage, seconds, dispatches } in times {
+        let at = all.iter().position(|have| have.pass == pass && have.kernel == stage).unwrap_or_else(|| {
+            all.push(KernelTimes {
+                pass,
+                kernel: stage,
+                dispatches,
+                seconds: Vec::new(),
+                cpu_seconds: Vec::new(),
+            });
             all.len() - 1
         });
         let list = if by_cpu { &mut all[at].cpu_seconds } else { &mut all[at].seconds };
@@ -362,7 +368,7 @@ fn main() -> Fallible<()> {
     }
     let model = step.blocks.download(&gpu)?;
 
-    let stage_of = |name: &str| stages.iter().find(|times| times.stage == name);
+    let stage_of = |name: &str| stages.iter().find(|times| times.kernel == name);
     let rate_of = |name: &str, rate: f64| {
         let evaluations = work.needed_evaluations as f64;
         let (seconds, cpu) =
@@ -382,10 +388,10 @@ fn main() -> Fallible<()> {
     let stages: Vec<Value> = stages
         .iter()
         .map(|times| {
-            let bytes = step.bytes(times.stage, &work);
+            let bytes = step.bytes(times.kernel, &work);
             let mut object = times_of(&gpu, &times.seconds, &times.cpu_seconds, bytes);
             object.insert("pass".to_owned(), json!(times.pass.name()));
-            object.insert("stage".to_owned(), json!(times.stage));
+            object.insert("stage".to_owned(), json!(times.kernel));
             object.insert("dispatches".to_owned(), json!(times.dispatches));
             Value::Object(object)
         })

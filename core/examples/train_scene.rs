@@ -17,7 +17,7 @@ use cpu_time::cpu_seconds;
 use fathom_core::config::{DataConfig, Medium, TrainConfig, WaterConfig};
 use fathom_core::floaters::clear_ranges;
 use fathom_core::gaussians::Gaussians;
-use fathom_core::gpu::{Gpu, GpuOptions, Renderer, Show, StageTime, WaterView};
+use fathom_core::gpu::{Gpu, GpuOptions, KernelTime, Output, Renderer, WaterView};
 use fathom_core::memory::{MemoryForecast, RunSize, visible_in_fullest_view};
 use fathom_core::metrics::{psnr, quantised, ssim};
 use fathom_core::picture::{Photograph, prepare, prepared_camera};
@@ -131,9 +131,9 @@ fn evaluate(
     Ok((psnr_sum / count, ssim_sum / count))
 }
 
-fn add(times: &mut Vec<StageTime>, more: Vec<StageTime>) {
+fn add(times: &mut Vec<KernelTime>, more: Vec<KernelTime>) {
     for time in more {
-        match times.iter_mut().find(|have| have.stage == time.stage) {
+        match times.iter_mut().find(|have| have.kernel == time.kernel) {
             Some(have) => {
                 have.seconds += time.seconds;
                 have.dispatches += time.dispatches;
@@ -191,8 +191,8 @@ fn clear_quality(
     test: &InMemory,
     folder: &std::path::Path,
 ) -> Fallible<Option<(f64, f64)>> {
-    let mut clear =
-        Renderer::new(Arc::clone(gpu), model)?.with_water(Some(WaterView { show: Show::Clear, ..water }));
+    let mut clear = Renderer::new(Arc::clone(gpu), model)?
+        .with_water(Some(WaterView { output: Output::Restored, ..water }));
     let mut plain = Renderer::new(Arc::clone(gpu), model)?;
     let (mut sums, mut count) = ([0.0; 2], 0.0);
     for view in &test.views {
@@ -300,7 +300,7 @@ fn main() -> Fallible<()> {
         }
         if time_every > 0 && progress.iteration.is_multiple_of(time_every) {
             for time in trainer.time_iteration()? {
-                eprintln!("    {:24} {:8.2} ms", time.stage, time.seconds * 1e3);
+                eprintln!("    {:24} {:8.2} ms", time.kernel, time.seconds * 1e3);
             }
         }
     }
@@ -337,7 +337,7 @@ fn main() -> Fallible<()> {
     let is_cpu = gpu.adapter().is_cpu;
     let shares: serde_json::Map<String, serde_json::Value> = stages
         .iter()
-        .map(|time| (time.stage.to_owned(), serde_json::json!((time.seconds / total * 1e4).round() / 1e4)))
+        .map(|time| (time.kernel.to_owned(), serde_json::json!((time.seconds / total * 1e4).round() / 1e4)))
         .collect();
     let result = serde_json::json!({
         "adapter": gpu.adapter().name,

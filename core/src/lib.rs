@@ -4,13 +4,14 @@
 //! Everything that needs a GPU sits behind the feature `gpu`; a coordinator alone builds without it.
 
 pub mod appearance;
+pub mod axes;
 pub mod config;
 pub mod cover;
 pub mod duration;
 mod error;
 pub mod exchange;
 pub mod floaters;
-pub mod frame;
+
 pub mod gaussians;
 #[cfg(feature = "gpu")]
 pub mod gpu;

@@ -33,8 +33,8 @@ const REST_RATE: f32 = 0.002;
 
 impl ViewerColours {
     /// `model` with other colours: blended in sRGB over black, it shows from `views` what the model shows
-    /// through `shown` (J, with [`crate::gpu::Show::Clear`]). Positions, shapes and opacities stay to the
-    /// bit.
+    /// through `shown` (J, with [`crate::gpu::Output::Restored`]). Positions, shapes and opacities stay to
+    /// the bit.
     ///
     /// `report` is told where the training stands.
     ///

@@ -3,13 +3,13 @@
 
 use std::collections::BTreeSet;
 
-use fathom_core::gpu::{TileLayout, shader_source, stage_names, stage_variants};
+use fathom_core::gpu::{TileLayout, kernel_names, kernel_variants, shader_source};
 use naga::valid::{Capabilities, ValidationFlags, Validator};
 
 #[test]
 fn shaders_validate() {
     let mut count = 0;
-    for name in stage_names().chain(stage_variants()) {
+    for name in kernel_names().chain(kernel_variants()) {
         for layout in TileLayout::ALL {
             let source = shader_source(name, layout).expect("the stage and its imports are there");
             let module = naga::front::wgsl::parse_str(&source)
@@ -40,6 +40,6 @@ fn every_shader_file_is_a_stage() {
             entry.expect("an entry").file_name().into_string().ok()?.strip_suffix(".wgsl").map(str::to_owned)
         })
         .collect();
-    let stages: BTreeSet<String> = stage_names().map(str::to_owned).collect();
+    let stages: BTreeSet<String> = kernel_names().map(str::to_owned).collect();
     assert_eq!(files, stages);
 }

@@ -22,7 +22,7 @@ pub const MAX_MESSAGE_BYTES: usize = 4096;
 
 /// One log line.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Line {
+pub struct LoggedLine {
     /// When, Unix milliseconds.
     pub time_ms: u64,
     /// Severity.
@@ -31,7 +31,7 @@ pub struct Line {
     pub message: String,
 }
 
-impl Line {
+impl LoggedLine {
     /// A line with the current time.
     pub fn now(level: Level, message: &str) -> Self {
         // A clock before 1970 counts as 1970: times are for display only.
@@ -43,7 +43,7 @@ impl Line {
 /// Receives the lines of an attempt. Called on the thread that logs, so it must neither wait nor log.
 pub trait Sink: Send + Sync {
     /// Takes a line, or drops it.
-    fn line(&self, line: Line);
+    fn line(&self, line: LoggedLine);
 }
 
 struct Attached(Arc<dyn Sink>);
@@ -71,7 +71,7 @@ impl<S: Subscriber + for<'a> LookupSpan<'a>> Layer<S> for Capture {
         let mut text = Text::default();
         event.record(&mut text);
         let Text { message, fields } = text;
-        sink.line(Line::now(*event.metadata().level(), &format!("{message}{fields}")));
+        sink.line(LoggedLine::now(*event.metadata().level(), &format!("{message}{fields}")));
     }
 }
 
@@ -181,7 +181,7 @@ mod tests {
     struct Kept(Mutex<Vec<String>>);
 
     impl Sink for Kept {
-        fn line(&self, Line { level, message, .. }: Line) {
+        fn line(&self, LoggedLine { level, message, .. }: LoggedLine) {
             self.0.lock().unwrap().push(format!("{level} {message}"));
         }
     }

@@ -9,7 +9,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use tokio::sync::Notify;
 use tracing::Level;
 
-use crate::capture::{Line, Sink};
+use crate::capture::{LoggedLine, Sink};
 
 /// Number of lines in a batch.
 pub const BATCH: usize = 256;
@@ -32,7 +32,7 @@ struct Waiting<K> {
 struct Numbered<K> {
     of: Arc<K>,
     number: u64,
-    line: Line,
+    line: LoggedLine,
 }
 
 /// Lines of one attempt, by ascending number.
@@ -40,7 +40,7 @@ pub struct Batch<K> {
     /// The attempt.
     pub of: Arc<K>,
     /// Its lines with their numbers, which count from 1 in each attempt.
-    pub lines: Vec<(u64, Line)>,
+    pub lines: Vec<(u64, LoggedLine)>,
 }
 
 impl<K> Default for Queue<K> {
@@ -121,7 +121,7 @@ struct Count {
 }
 
 impl<K: Send + Sync + 'static> Source<K> {
-    fn push(&self, waiting: &mut Waiting<K>, count: &mut Count, line: Line) {
+    fn push(&self, waiting: &mut Waiting<K>, count: &mut Count, line: LoggedLine) {
         count.last += 1;
         waiting.bytes += line.message.len();
         waiting.lines.push_back(Numbered { of: Arc::clone(&self.of), number: count.last, line });
@@ -132,13 +132,13 @@ impl<K: Send + Sync + 'static> Source<K> {
         let dropped = std::mem::take(&mut count.dropped);
         if dropped > 0 {
             let message = format!("dropped {dropped} lines here: they came faster than they could be stored");
-            self.push(waiting, count, Line::now(Level::WARN, &message));
+            self.push(waiting, count, LoggedLine::now(Level::WARN, &message));
         }
     }
 }
 
 impl<K: Send + Sync + 'static> Sink for Source<K> {
-    fn line(&self, line: Line) {
+    fn line(&self, line: LoggedLine) {
         let mut waiting = self.queue.lock();
         let mut count = self.count.lock().unwrap_or_else(PoisonError::into_inner);
         if waiting.lines.len() >= MAX_LINES || waiting.bytes + line.message.len() > MAX_BYTES {
@@ -176,7 +176,7 @@ mod tests {
         let queue = Arc::new(Queue::default());
         let (first, second) = (queue.sink(1), queue.sink(2));
         for (sink, message) in [(&first, "a"), (&first, "b"), (&second, "c"), (&first, "d")] {
-            sink.line(Line::now(Level::INFO, message));
+            sink.line(LoggedLine::now(Level::INFO, message));
         }
         for _ in 0..2 {
             assert_eq!(messages(&queue.next().await), [(1, "a"), (2, "b")], "kept until it is removed");
@@ -194,15 +194,15 @@ mod tests {
         let queue = Arc::new(Queue::default());
         let sink = queue.sink(1);
         for _ in 0..MAX_LINES + 7 {
-            sink.line(Line::now(Level::INFO, "x"));
+            sink.line(LoggedLine::now(Level::INFO, "x"));
         }
         assert_eq!(queue.lock().lines.len(), MAX_LINES);
         let batch = queue.next().await;
         queue.remove(&batch);
-        sink.line(Line::now(Level::INFO, "after"));
-        sink.line(Line::now(Level::INFO, &"y".repeat(4000)));
+        sink.line(LoggedLine::now(Level::INFO, "after"));
+        sink.line(LoggedLine::now(Level::INFO, &"y".repeat(4000)));
         for _ in 0..MAX_BYTES / 4000 {
-            sink.line(Line::now(Level::INFO, &"z".repeat(4000)));
+            sink.line(LoggedLine::now(Level::INFO, &"z".repeat(4000)));
         }
         drop(sink);
         let waiting = queue.lock();

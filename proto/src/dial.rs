@@ -43,7 +43,7 @@ const LOOKS_AT_EVERYTHING: [&str; 4] = ["BeginUpload", "CommitDataset", "CreateJ
 const LONGER: u32 = 30;
 
 /// A connection that adds the token and a deadline to every call.
-pub type Line = InterceptedService<Channel, Credentials>;
+pub type Connection = InterceptedService<Channel, Credentials>;
 
 /// Address of a coordinator and connection settings.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -205,7 +205,7 @@ impl Dial {
     ///
     /// # Errors
     /// When the address or a file cannot be used, or the token would be sent in plain text.
-    pub fn lazily(&self) -> Result<Line, DialError> {
+    pub fn lazily(&self) -> Result<Connection, DialError> {
         let (endpoint, credentials) = self.prepare()?;
         let channel = match &self.connector {
             Some(Connector(connect)) => connect(&endpoint),
@@ -218,7 +218,7 @@ impl Dial {
     ///
     /// # Errors
     /// As [`Dial::lazily`], and when no server answers.
-    pub async fn now(&self) -> Result<Line, DialError> {
+    pub async fn now(&self) -> Result<Connection, DialError> {
         if self.connector.is_some() {
             return self.lazily();
         }

@@ -120,11 +120,11 @@ fn by_light(medium: u32, water: Water, s: vec3<f32>, range: f32, v: vec3<f32>) -
 
 // What the rate of a colour `s` (sRGB) is multiplied by where it is seen at `range` through the water: 1 over
 // the slope of what is seen, in sRGB too, so that a step is as large there as in air; at least 1, at most
-// MOST_COLOUR_HASTE.
-const MOST_COLOUR_HASTE: f32 = 8.0;
+// MAX_COLOUR_LR_SCALE.
+const MAX_COLOUR_LR_SCALE: f32 = 8.0;
 
-fn haste_under_water(water: Water, s: vec3<f32>, range: f32) -> vec3<f32> {
+fn lr_scale_under_water(water: Water, s: vec3<f32>, range: f32) -> vec3<f32> {
     let here = refined(water, range);
     let slope = exp(-here.beta_d * range) * decoded_slope(s) * encoded_slope(lit(here, s, range));
-    return 1.0 / clamp(slope, vec3<f32>(1.0 / MOST_COLOUR_HASTE), vec3<f32>(1.0));
+    return 1.0 / clamp(slope, vec3<f32>(1.0 / MAX_COLOUR_LR_SCALE), vec3<f32>(1.0));
 }

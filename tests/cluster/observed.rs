@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 
 use crate::support::{FakeTrainer, TestCluster, incarnation_of, page, reason_of, registration};
 use fathom_observe::{Guard, LogFormat, Logging};
-use fathom_proto::dial::{Dial, Line};
+use fathom_proto::dial::{Connection, Dial};
 use fathom_proto::v1;
 use fathom_proto::v1::LogSeverity;
 use fathom_proto::worker::v1 as worker_v1;
@@ -239,7 +239,10 @@ async fn a_job_log_keeps_all_attempts_after_their_workers_left() {
 }
 
 /// A hand-driven worker with a lease on a job's only partition.
-async fn lease_by_hand(cluster: &TestCluster, name: &str) -> (WorkerServiceClient<Line>, worker_v1::Lease) {
+async fn lease_by_hand(
+    cluster: &TestCluster,
+    name: &str,
+) -> (WorkerServiceClient<Connection>, worker_v1::Lease) {
     let mut worker = WorkerServiceClient::new(Dial::to(&cluster.url()).lazily().unwrap());
     worker.register(registration(name)).await.unwrap();
     let claim = worker_v1::ClaimRequest {
@@ -267,7 +270,7 @@ async fn late_log_lines_are_stored_once_under_their_own_lease() {
     let cluster = TestCluster::start().await;
     let job = cluster.submit("by hand", 1).await;
     let (mut worker, lease) = lease_by_hand(&cluster, "first").await;
-    let append = async |worker: &mut WorkerServiceClient<Line>, lease: &worker_v1::Lease, lines| {
+    let append = async |worker: &mut WorkerServiceClient<Connection>, lease: &worker_v1::Lease, lines| {
         let request = worker_v1::AppendLogsRequest { lease: Some(lease.clone()), lines };
         worker.append_logs(request).await.map(drop).map_err(|status| reason_of(&status))
     };

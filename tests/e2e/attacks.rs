@@ -10,7 +10,7 @@ use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
-use fathom_proto::dial::{Dial, Line, Secret};
+use fathom_proto::dial::{Connection, Dial, Secret};
 use fathom_proto::v1::job_service_client::JobServiceClient;
 use fathom_proto::v1::upload_service_client::UploadServiceClient;
 use fathom_proto::v1::{BeginUploadRequest, BlobRef, ReadBlobRequest, WatchJobRequest, WriteBlobRequest};
@@ -89,7 +89,7 @@ impl Attacked {
         (String::from_utf8(output.stdout).unwrap(), begun.elapsed())
     }
 
-    fn uploads(&self, token: &str) -> UploadServiceClient<Line> {
+    fn uploads(&self, token: &str) -> UploadServiceClient<Connection> {
         let dial = Dial { token: Some(Secret::new(token)), ..Dial::to(&self.url) };
         UploadServiceClient::new(dial.lazily().unwrap())
     }
@@ -117,7 +117,7 @@ fn blob(content: &[u8]) -> BlobRef {
     BlobRef { digest: blake3::hash(content).to_hex().to_string(), size_bytes: content.len() as u64 }
 }
 
-async fn upload(client: &mut UploadServiceClient<Line>, content: &[u8]) -> BlobRef {
+async fn upload(client: &mut UploadServiceClient<Connection>, content: &[u8]) -> BlobRef {
     let whole = blob(content);
     let count = content.len().div_ceil(PIECE);
     let pieces: Vec<_> = content

@@ -7,7 +7,7 @@ use fathom_coordinator::{Coordinator, CoordinatorConfig, serve};
 use fathom_core::scene::{self, Manifest};
 use fathom_proto::admin::v1::admin_service_client::AdminServiceClient;
 use fathom_proto::admin::v1::{IssueTokenRequest, Role};
-use fathom_proto::dial::{Dial, Line, Secret, reason};
+use fathom_proto::dial::{Connection, Dial, Secret, reason};
 use fathom_proto::v1::job_service_client::JobServiceClient;
 use fathom_proto::v1::upload_service_client::UploadServiceClient;
 use fathom_proto::v1::{BlobRef, CreateJobRequest, Job, ListJobsRequest, PauseJobRequest, WriteBlobRequest};
@@ -24,7 +24,7 @@ pub struct GuardedCluster {
 
 /// A caller with its credentials.
 pub struct Caller {
-    pub line: Line,
+    pub line: Connection,
 }
 
 impl GuardedCluster {
@@ -84,19 +84,19 @@ impl GuardedCluster {
 }
 
 impl Caller {
-    pub fn jobs(&self) -> JobServiceClient<Line> {
+    pub fn jobs(&self) -> JobServiceClient<Connection> {
         JobServiceClient::new(self.line.clone())
     }
 
-    pub fn uploads(&self) -> UploadServiceClient<Line> {
+    pub fn uploads(&self) -> UploadServiceClient<Connection> {
         UploadServiceClient::new(self.line.clone())
     }
 
-    pub fn admin(&self) -> AdminServiceClient<Line> {
+    pub fn admin(&self) -> AdminServiceClient<Connection> {
         AdminServiceClient::new(self.line.clone())
     }
 
-    pub fn workers(&self) -> WorkerServiceClient<Line> {
+    pub fn workers(&self) -> WorkerServiceClient<Connection> {
         WorkerServiceClient::new(self.line.clone())
     }
 

@@ -12,7 +12,7 @@ use fathom_core::picture::encode_png;
 use fathom_core::scene::{Camera, CameraModel, Manifest, ManifestView, Points, Pose};
 use fathom_proto::admin::v1 as admin_v1;
 use fathom_proto::admin::v1::admin_service_client::AdminServiceClient;
-use fathom_proto::dial::{Dial, Line};
+use fathom_proto::dial::{Connection, Dial};
 use fathom_proto::v1;
 use fathom_proto::v1::job_service_client::JobServiceClient;
 use fathom_proto::v1::upload_service_client::UploadServiceClient;
@@ -46,7 +46,7 @@ pub struct TestCluster {
     pub manifest: Manifest,
     coordinator: Option<Coordinator>,
     config: CoordinatorConfig,
-    channel: Line,
+    channel: Connection,
 }
 
 impl TestCluster {
@@ -82,11 +82,11 @@ impl TestCluster {
         format!("http://{}", self.address())
     }
 
-    pub fn jobs(&self) -> JobServiceClient<Line> {
+    pub fn jobs(&self) -> JobServiceClient<Connection> {
         JobServiceClient::new(self.channel.clone())
     }
 
-    pub fn uploads(&self) -> UploadServiceClient<Line> {
+    pub fn uploads(&self) -> UploadServiceClient<Connection> {
         UploadServiceClient::new(self.channel.clone())
     }
 
@@ -95,7 +95,7 @@ impl TestCluster {
         page(self.coordinator.as_ref().unwrap().metrics_address().unwrap(), path).await
     }
 
-    pub fn admin(&self) -> AdminServiceClient<Line> {
+    pub fn admin(&self) -> AdminServiceClient<Connection> {
         AdminServiceClient::new(self.channel.clone())
     }
 

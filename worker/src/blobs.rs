@@ -7,7 +7,7 @@ use std::sync::Arc;
 use bytes::Bytes;
 use fathom_core::scene::BlobRef;
 use fathom_observe::threads;
-use fathom_proto::dial::{Line, reason};
+use fathom_proto::dial::{Connection, reason};
 use fathom_proto::v1::upload_service_client::UploadServiceClient;
 use fathom_proto::{CHUNK_BYTES, v1};
 use tokio::sync::mpsc;
@@ -77,7 +77,7 @@ pub fn hash_file(path: &Path) -> Result<BlobRef, WorkerError> {
 /// The object store of a coordinator.
 #[derive(Clone, Debug)]
 pub struct BlobClient {
-    client: UploadServiceClient<Line>,
+    client: UploadServiceClient<Connection>,
     /// See [`BlobClient::of_job`].
     job_id: String,
     trouble: Trouble,
@@ -85,7 +85,7 @@ pub struct BlobClient {
 
 impl BlobClient {
     /// Uses an existing connection, for the blobs of the caller's own tenant.
-    pub fn new(line: Line) -> Self {
+    pub fn new(line: Connection) -> Self {
         Self { client: UploadServiceClient::new(line), job_id: String::new(), trouble: Trouble::default() }
     }
 

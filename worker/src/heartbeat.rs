@@ -4,7 +4,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use fathom_observe::threads;
-use fathom_proto::dial::{Dial, Line, reason};
+use fathom_proto::dial::{Connection, Dial, reason};
 use fathom_proto::v1::Progress;
 use fathom_proto::worker::v1;
 use fathom_proto::worker::v1::worker_service_client::WorkerServiceClient;
@@ -248,7 +248,7 @@ async fn beat(
 
 /// Renews over a session, which delivers a stop request at once, or over single calls if there is none.
 struct Voice {
-    client: WorkerServiceClient<Line>,
+    client: WorkerServiceClient<Connection>,
     registration: v1::RegisterRequest,
     session: Option<Session>,
     /// Whether a session may be opened: after one ended, only once a single call was answered.

@@ -6,9 +6,9 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use fathom_observe::capture::{Line, Sink};
+use fathom_observe::capture::{LoggedLine, Sink};
 use fathom_observe::queue::{BATCH, Batch, Queue};
-use fathom_proto::dial::Line as Connection;
+use fathom_proto::dial::Connection;
 use fathom_proto::v1::LogSeverity;
 use fathom_proto::worker::v1;
 use fathom_proto::worker::v1::worker_service_client::WorkerServiceClient;
@@ -81,7 +81,7 @@ async fn ship(mut client: WorkerServiceClient<Connection>, lines: Arc<Queue<v1::
 }
 
 fn request(batch: &Batch<v1::Lease>) -> v1::AppendLogsRequest {
-    let line = |(number, line): &(u64, Line)| v1::LogLine {
+    let line = |(number, line): &(u64, LoggedLine)| v1::LogLine {
         number: *number,
         time: Some(Timestamp {
             seconds: (line.time_ms / 1000) as i64,

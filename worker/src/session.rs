@@ -7,7 +7,7 @@ use std::time::Duration;
 use bytes::Bytes;
 use fathom_core::scene::BlobRef;
 use fathom_observe::{attempt_span, capture, threads};
-use fathom_proto::dial::{Dial, Line, reason};
+use fathom_proto::dial::{Connection, Dial, reason};
 use fathom_proto::v1::Progress;
 use fathom_proto::worker::v1;
 use fathom_proto::worker::v1::worker_service_client::WorkerServiceClient;
@@ -48,7 +48,7 @@ const STOPS_WITHIN: Duration = Duration::from_secs(5);
 /// One GPU of a worker; a separate worker to the coordinator.
 pub struct Session {
     coordinator: Dial,
-    client: WorkerServiceClient<Line>,
+    client: WorkerServiceClient<Connection>,
     blobs: BlobClient,
     cache: BlobCache,
     executor: Arc<dyn Executor>,

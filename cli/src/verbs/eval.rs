@@ -14,7 +14,7 @@ use fathom_core::config::{DataConfig, MaskKeep};
 use fathom_core::cover::{self, CoverMeter, HeldOut};
 use fathom_core::floaters::floaters;
 use fathom_core::gaussians::Gaussians;
-use fathom_core::gpu::{Renderer, SeamRun, Show, WaterView};
+use fathom_core::gpu::{Output, Renderer, SeamRun, WaterView};
 use fathom_core::metrics::{self, SsimMap};
 use fathom_core::picture::{self, Photograph, linear_to_srgb, srgb_to_linear};
 use fathom_core::scene::{PinholeCamera, Pose, Purpose, Scene, View, load_scene};
@@ -272,11 +272,11 @@ fn measure(args: &EvalArgs) -> Result<Value> {
     let gpu = args.gpu.open()?;
     let adapter = gpu.adapter().name.clone();
     let water = fathom_core::ply::water_record(&path)?;
-    let through = |show| water.as_ref().map(|record| WaterView::of_record(record, show));
+    let through = |output| water.as_ref().map(|record| WaterView::of_record(record, output));
     let mip_filter = fathom_core::ply::is_antialiased(&path)?;
     let mut renderer = Renderer::new(Arc::clone(&gpu), &gaussians)?
         .with_mip_filter(mip_filter)
-        .with_water(through(Show::Seen));
+        .with_water(through(Output::Underwater));
     let mut seams = match seams::plan_of(&args.model, args.plan.as_deref())? {
         Some(plan) => seams::run_of(
             &gpu,
@@ -306,11 +306,11 @@ fn measure(args: &EvalArgs) -> Result<Value> {
         };
         let (psnr, ssim) = (metrics::psnr(&render, &photograph), map.as_ref().map(SsimMap::mean));
         let mut of_view = json!({ "name": view.name, "psnr": psnr, "ssim": ssim });
-        let clear = match through(Show::Clear) {
+        let clear = match through(Output::Restored) {
             // Without a medium, the render itself is compared with J.
             None => render.clone(),
-            show => {
-                renderer.set_water(show);
+            output => {
+                renderer.set_water(output);
                 let clear = renderer.render(&camera, &view.pose, [0.0; 3])?;
                 let clear = metrics::quantised(clear.width, clear.height, &clear.rgb);
                 // What was blended in sRGB a viewer shows as it is.
@@ -320,7 +320,7 @@ fn measure(args: &EvalArgs) -> Result<Value> {
                     let plain = metrics::quantised(plain.width, plain.height, &plain.rgb);
                     of_view["viewer_psnr"] = json!(metrics::psnr(&plain, &clear));
                 }
-                renderer.set_water(through(Show::Seen));
+                renderer.set_water(through(Output::Underwater));
                 clear
             }
         };

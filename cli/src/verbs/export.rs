@@ -4,10 +4,10 @@
 use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
+use fathom_core::axes;
 use fathom_core::config::DataConfig;
-use fathom_core::frame;
 use fathom_core::gaussians::Gaussians;
-use fathom_core::gpu::{Renderer, Show, WaterView};
+use fathom_core::gpu::{Output, Renderer, WaterView};
 use fathom_core::linear_colours::in_linear_light;
 use fathom_core::ply::{self, SplatReader, SplatWriter, write_whole};
 use fathom_core::scene::{Purpose, load_scene};
@@ -115,9 +115,9 @@ pub fn run(args: ExportArgs) -> Result<()> {
     let comment = white_point_comment(white.as_ref(), &mut comments)?;
     comments.extend(comment);
     let rotation = rotation(args.frame, &path, &comments)?;
-    comments.retain(|comment| !frame::is_in(comment));
+    comments.retain(|comment| !axes::is_in(comment));
     if let (Frame::Aligned, Some(rotation)) = (args.frame, rotation) {
-        comments.push(frame::comment(rotation));
+        comments.push(axes::comment(rotation));
     }
     write_whole(&args.output, |file| {
         let name = args.output.to_string_lossy();
@@ -130,7 +130,7 @@ pub fn run(args: ExportArgs) -> Result<()> {
                 (false, Some(found)) => white::in_srgb(block, found.gains),
             };
             let block = match rotation {
-                Some(rotation) => frame::turned(block, rotation),
+                Some(rotation) => axes::turned(block, rotation),
                 None => block,
             };
             writer.write(&block)?;
@@ -167,7 +167,7 @@ fn white_point_of(args: &ExportArgs, path: &Path) -> Result<Option<WhitePoint>> 
     let found = || -> Result<Option<WhitePoint>> {
         let mut renderer = Renderer::new(args.gpu.open()?, &model::load(path)?)?
             .with_mip_filter(ply::is_antialiased(path)?)
-            .with_water(record.map(|record| WaterView::of_record(&record, Show::Clear)));
+            .with_water(record.map(|record| WaterView::of_record(&record, Output::Restored)));
         args.white_point
             .find(&shots, |camera, pose| renderer.render(camera, pose, [0.0; 3]).map_err(Into::into))
     };
@@ -206,7 +206,7 @@ fn for_viewers(args: &ExportArgs, path: &Path, white: Option<&WhitePoint>) -> Re
     let iterations = args.iterations.unwrap_or(VIEWER_ITERATIONS);
     let progress = Progress::new("colours", u64::from(iterations), Unit::Count("pictures"));
     let colours = ViewerColours { iterations, seed: 1 };
-    let shown = WaterView::of_record(&record, Show::Clear);
+    let shown = WaterView::of_record(&record, Output::Restored);
     let found = colours.find(&args.gpu.open()?, &model, shown, views, |now| {
         progress.set(u64::from(now.iteration), "");
     });
@@ -214,7 +214,7 @@ fn for_viewers(args: &ExportArgs, path: &Path, white: Option<&WhitePoint>) -> Re
     progress.finish();
     let mut comments = SplatReader::open(path)?.comments().to_vec();
     // The water applies to colours that are blended in linear light.
-    comments.retain(|comment| !WaterRecord::is_in(comment) && !frame::is_in(comment));
+    comments.retain(|comment| !WaterRecord::is_in(comment) && !axes::is_in(comment));
     comments.push(VIEWER_COLOURS.to_owned());
     let comment = white_point_comment(white, &mut comments)?;
     comments.extend(comment);
@@ -226,8 +226,8 @@ fn for_viewers(args: &ExportArgs, path: &Path, white: Option<&WhitePoint>) -> Re
         Frame::Scene => model,
         Frame::Aligned => {
             let rotation = model::alignment(path)?;
-            comments.push(frame::comment(rotation));
-            frame::turned(model, rotation)
+            comments.push(axes::comment(rotation));
+            axes::turned(model, rotation)
         }
     };
     ply::write_model(&args.output, &model, &comments)?;
@@ -271,7 +271,7 @@ fn views(args: &ExportArgs) -> Result<Vec<TrainView>> {
 
 /// The rotation from the axes of the model at `path` to the requested ones; `None` if they are the same.
 fn rotation(to: Frame, path: &Path, comments: &[String]) -> Result<Option<DQuat>> {
-    let has = frame::among(comments)?;
+    let has = axes::among(comments)?;
     Ok(match (to, has) {
         (Frame::Scene, has) => has.map(|from_scene| from_scene.inverse()),
         (Frame::Aligned, None) => Some(model::alignment(path)?),

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use clap::{ArgGroup, Args, ValueEnum};
 use fathom_core::config::DataConfig;
 use fathom_core::gaussians::Gaussians;
-use fathom_core::gpu::{Rendered, Renderer, Show, WaterView};
+use fathom_core::gpu::{Output, Rendered, Renderer, WaterView};
 use fathom_core::picture;
 use fathom_core::scene::{CameraPath, Orbit, PinholeCamera, Pose, Purpose, load_scene};
 use fathom_core::white_point::apply;
@@ -223,10 +223,10 @@ impl RenderArgs {
     /// Rendering of the model's water; `None` if it has none.
     fn water_view(&self, path: &Path) -> Result<Option<WaterView>> {
         let record = fathom_core::ply::water_record(path)?;
-        let show = match self.water {
-            WaterShown::On => Show::Seen,
-            WaterShown::Off => Show::Clear,
-            WaterShown::Only => Show::Veil,
+        let output = match self.water {
+            WaterShown::On => Output::Underwater,
+            WaterShown::Off => Output::Restored,
+            WaterShown::Only => Output::Backscatter,
         };
         if record.is_none() && self.water != WaterShown::Off {
             return Err(CliError::Message(format!(
@@ -235,7 +235,7 @@ impl RenderArgs {
                 path.display()
             )));
         }
-        Ok(record.map(|record| WaterView::of_record(&record, show)))
+        Ok(record.map(|record| WaterView::of_record(&record, output)))
     }
 
     fn orbit_of(&self, model: &Gaussians) -> Result<Orbit> {

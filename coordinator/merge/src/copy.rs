@@ -9,7 +9,7 @@ use std::io::Write;
 use std::path::Path;
 
 use crate::ply_rows::{BLOCK_ROWS, Blocks};
-use crate::source::{Block, Extent, Place, Source};
+use crate::source::{Extent, Place, RowBlock, Source};
 use crate::survey::Survey;
 use crate::thinning::Thinning;
 use crate::{MergeError, MergedBlock, MergedPartition};
@@ -103,8 +103,8 @@ struct KeptRows<'a> {
 
 impl<'a> KeptRows<'a> {
     fn new(sources: &'a [Source<'a>], survey: &'a Survey, thinning: Thinning) -> Self {
-        let counts = |(source, blocks): (&Source<'_>, &Vec<Block>)| {
-            let sum = |count: fn(&Block) -> u32| blocks.iter().map(|block| u64::from(count(block))).sum();
+        let counts = |(source, blocks): (&Source<'_>, &Vec<RowBlock>)| {
+            let sum = |count: fn(&RowBlock) -> u32| blocks.iter().map(|block| u64::from(count(block))).sum();
             let (inside, not_finite): (u64, u64) = (sum(|block| block.inside), sum(|block| block.not_finite));
             MergedPartition {
                 partition: source.partition.id,
@@ -145,7 +145,7 @@ impl<'a> KeptRows<'a> {
     }
 
     /// Appends the remaining rows of the current block.
-    fn append(&mut self, block: &Block, buffer: &mut Vec<u8>) -> Result<(), MergeError> {
+    fn append(&mut self, block: &RowBlock, buffer: &mut Vec<u8>) -> Result<(), MergeError> {
         let (file, number) = (&self.sources[self.source].file, self.block as u64);
         let reader = match &mut self.reader {
             Some(reader) => reader,

@@ -10,7 +10,7 @@ use crate::border::Bands;
 use crate::candidate::Candidate;
 use crate::duplicates::{CANDIDATE_BYTES, Decisions, Duplicate, Region};
 use crate::ply_rows::Blocks;
-use crate::source::{Block, Extent, Source};
+use crate::source::{Extent, RowBlock, Source};
 use crate::survey::Pass;
 
 impl Pass {
@@ -21,7 +21,7 @@ impl Pass {
     pub fn duplicates(
         &self,
         sources: &[Source<'_>],
-        blocks: &[Vec<Block>],
+        blocks: &[Vec<RowBlock>],
     ) -> Result<BTreeMap<u32, Vec<Duplicate>>, MergeError> {
         let Some(bounds) = &self.bounds else { return Ok(BTreeMap::new()) };
         let mut decisions = Decisions::default();
@@ -41,7 +41,7 @@ impl Pass {
     fn load(
         &self,
         sources: &[Source<'_>],
-        blocks: &[Vec<Block>],
+        blocks: &[Vec<RowBlock>],
         region: &Region,
         bounded: bool,
     ) -> Result<Option<Vec<Candidate>>, MergeError> {
@@ -76,7 +76,7 @@ impl Pass {
 }
 
 /// The box of all blocks with candidates, and the greatest reach.
-fn around(blocks: &[Vec<Block>]) -> (Region, f32) {
+fn around(blocks: &[Vec<RowBlock>]) -> (Region, f32) {
     let (mut extent, mut reach) = (Extent::NONE, 0.0_f32);
     for block in blocks.iter().flatten().filter(|block| block.reach >= 0.0) {
         extent.add(block.bounds.low, None);

@@ -45,7 +45,7 @@ impl Source<'_> {
 
 /// A run of rows.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Block {
+pub struct RowBlock {
     /// Checksum of its bytes.
     pub crc: u32,
     /// Rows whose centre lies in the cell.
@@ -87,7 +87,7 @@ impl Extent {
     }
 }
 
-impl Block {
+impl RowBlock {
     /// Compares the bytes of this block with those of the first pass.
     ///
     /// # Errors

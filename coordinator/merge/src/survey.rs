@@ -16,13 +16,13 @@ use crate::border::Bands;
 use crate::candidate::{Bounds, Candidate, RowId};
 use crate::near_borders::NearBorders;
 use crate::ply_rows::BLOCK_ROWS;
-use crate::source::{Block, Extent, Place, Source};
+use crate::source::{Extent, Place, RowBlock, Source};
 use crate::thinning::{Opacities, bin};
 
 /// The result of the first pass.
 pub struct Survey {
     /// Blocks of each source, in order.
-    pub blocks: Vec<Vec<Block>>,
+    pub blocks: Vec<Vec<RowBlock>>,
     /// Opacities of all Gaussians that lie in their cell and are not duplicates.
     pub opacities: Opacities,
     /// Rows to remove as duplicates, by source, ascending.
@@ -35,9 +35,9 @@ pub struct Survey {
 /// When a file cannot be read or differs from its digest: the error of the first such source.
 pub fn survey(sources: &[Source<'_>], config: &MergeConfig) -> Result<Survey, MergeError> {
     let pass = Pass::new(sources, config);
-    let surveyed: Vec<Result<Vec<Block>, MergeError>> =
+    let surveyed: Vec<Result<Vec<RowBlock>, MergeError>> =
         sources.par_iter().map(|source| pass.survey(source)).collect();
-    let blocks: Vec<Vec<Block>> = surveyed.into_iter().collect::<Result<_, _>>()?;
+    let blocks: Vec<Vec<RowBlock>> = surveyed.into_iter().collect::<Result<_, _>>()?;
     let gone = pass.duplicates(sources, &blocks)?;
     let mut opacities = pass.opacities.into_inner().unwrap_or_else(PoisonError::into_inner);
     gone.values().flatten().for_each(|row| opacities.remove(row.logit));
@@ -73,7 +73,7 @@ impl Pass {
         }
     }
 
-    fn survey(&self, source: &Source<'_>) -> Result<Vec<Block>, MergeError> {
+    fn survey(&self, source: &Source<'_>) -> Result<Vec<RowBlock>, MergeError> {
         let file = &source.file;
         let bands = Bands::new(source.partition, self.share);
         let mut opacities = Opacities::new();
@@ -113,7 +113,7 @@ impl Pass {
         bands: &Bands,
         mut visit: impl FnMut(f32),
         candidates: &mut Vec<Candidate>,
-    ) -> Block {
+    ) -> RowBlock {
         let layout = &source.file.layout;
         let (mut inside, mut not_finite) = (0, 0);
         let (mut lowest_bin, mut bounds, mut reach) = (u16::MAX, Extent::NONE, -1.0_f32);
@@ -137,7 +137,7 @@ impl Pass {
                 candidates.push(candidate);
             }
         }
-        Block { crc: crc32c::crc32c(rows), inside, not_finite, lowest_bin, bounds, reach }
+        RowBlock { crc: crc32c::crc32c(rows), inside, not_finite, lowest_bin, bounds, reach }
     }
 
     /// A row of the cell that may be a duplicate: near a border, and not one of the shared Gaussians.

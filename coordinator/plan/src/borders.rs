@@ -26,7 +26,7 @@ pub(super) fn stage(
     points: &AlignedPoints,
     extent: &Extent,
 ) -> Option<BorderStage> {
-    if !config.borders.is_refined(cells.len()) {
+    if !config.borders.is_enabled_for(cells.len()) {
         return None;
     }
     let width = config.borders.width * extent.viewing_distance.unwrap_or(extent.radius);

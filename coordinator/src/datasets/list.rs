@@ -51,7 +51,7 @@ pub struct FileList {
 
 /// One line of a list.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Line<'a> {
+pub struct FileEntry<'a> {
     /// Its path in the dataset.
     pub path: &'a str,
     /// BLAKE3 of its content, 64 hex digits.
@@ -60,7 +60,7 @@ pub struct Line<'a> {
     pub bytes: u64,
 }
 
-impl Line<'_> {
+impl FileEntry<'_> {
     /// Its content.
     pub fn blob(&self) -> BlobRef {
         BlobRef { digest: self.digest.to_owned(), bytes: self.bytes }
@@ -198,7 +198,7 @@ impl FileList {
     }
 
     /// Its files, by ascending path.
-    pub fn files(&self) -> impl ExactSizeIterator<Item = Line<'_>> {
+    pub fn files(&self) -> impl ExactSizeIterator<Item = FileEntry<'_>> {
         (0..self.starts.len() as u32).map(|index| self.line(index))
     }
 
@@ -208,7 +208,7 @@ impl FileList {
     }
 
     /// Distinct blobs, each with the first of its files.
-    pub fn blobs(&self) -> impl ExactSizeIterator<Item = Line<'_>> {
+    pub fn blobs(&self) -> impl ExactSizeIterator<Item = FileEntry<'_>> {
         let mut firsts = self.by_digest();
         firsts.dedup_by_key(|index| self.line(*index).digest);
         firsts.sort_unstable();
@@ -216,7 +216,7 @@ impl FileList {
     }
 
     /// The file with this path.
-    pub fn find(&self, path: &str) -> Option<Line<'_>> {
+    pub fn find(&self, path: &str) -> Option<FileEntry<'_>> {
         let found = self.starts.binary_search_by(|start| self.line_at(*start).path.cmp(path));
         found.ok().map(|index| self.line_at(self.starts[index]))
     }
@@ -228,24 +228,24 @@ impl FileList {
         lines
     }
 
-    fn line(&self, index: u32) -> Line<'_> {
+    fn line(&self, index: u32) -> FileEntry<'_> {
         self.line_at(self.starts[index as usize])
     }
 
-    fn line_at(&self, start: u32) -> Line<'_> {
+    fn line_at(&self, start: u32) -> FileEntry<'_> {
         let rest = &self.text[start as usize..];
         let line = rest.split_once('\n').map_or(rest, |(line, _)| line);
         // Every line was verified when the list was made.
-        line_of(line).unwrap_or(Line { path: "", digest: "", bytes: 0 })
+        line_of(line).unwrap_or(FileEntry { path: "", digest: "", bytes: 0 })
     }
 }
 
 const NO_FILE: &str = "is empty: a dataset has at least one file";
 
-fn line_of(line: &str) -> Option<Line<'_>> {
+fn line_of(line: &str) -> Option<FileEntry<'_>> {
     let (digest, rest) = line.split_once(' ')?;
     let (bytes, path) = rest.split_once(' ')?;
-    Some(Line { path, digest, bytes: bytes.parse().ok()? })
+    Some(FileEntry { path, digest, bytes: bytes.parse().ok()? })
 }
 
 /// A text, shortened for messages.
@@ -303,7 +303,7 @@ mod tests {
         assert_eq!(FileList::parse(text.into_bytes()), Ok(sorted.clone()));
         assert_eq!((sorted.bytes(), sorted.count()), (25, 3));
         let digest = b.to_string();
-        assert_eq!(sorted.find("b.jpg"), Some(Line { path: "b.jpg", digest: &digest, bytes: 5 }));
+        assert_eq!(sorted.find("b.jpg"), Some(FileEntry { path: "b.jpg", digest: &digest, bytes: 5 }));
         assert_eq!(sorted.find("b"), None);
     }
 

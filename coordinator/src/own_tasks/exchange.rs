@@ -48,7 +48,7 @@ pub async fn find(objects: &BlobStore, view: &JobView) -> Result<TaskOutput, Own
         rows.extend(refined.rows.as_ref().map(|blob| (partition, of_message(blob))));
         said.push((partition, refined));
     }
-    let water = match config.water.is_refined(said.len() as u32) {
+    let water = match config.water.is_joint_for(said.len() as u32) {
         true => Some(water_of(objects, view, &said).await?),
         false => None,
     };

@@ -36,7 +36,7 @@ pub async fn plan_job(
     tracing::info!(job = %job.job_id, partitions = plan.partitions.len(), reason = plan.cut.reason, "partitioned the scene");
     let mut warnings = plan.warnings(&config.train);
     if config.water.partitions == WaterPartitions::Joint
-        && !config.water.is_refined(plan.partitions.len() as u32)
+        && !config.water.is_joint_for(plan.partitions.len() as u32)
     {
         warnings.push(
             "water.partitions = \"joint\" has no effect here: it needs more than one partition and a medium"

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use fathom_observe::capture::{Line, tidy};
+use fathom_observe::capture::{LoggedLine, tidy};
 use fathom_observe::queue::{BATCH, Queue};
 use fathom_observe::threads;
 use fathom_proto::{v1, worker::v1 as worker_v1};
@@ -103,7 +103,7 @@ async fn write(
 
 /// Writes a line about an attempt to its log.
 pub fn note(shared: &State, lease: &Lease, level: Level, message: &str) {
-    shared.own_lines.sink(lease.clone()).line(Line::now(level, message));
+    shared.own_lines.sink(lease.clone()).line(LoggedLine::now(level, message));
 }
 
 /// Stores the lines of the coordinator's own tasks until it stops.

@@ -95,7 +95,7 @@ pub trait Appearance: Any + Send + Sync {
     /// Records the step on `image`, `[H*W]` vec4; returns what comes next in the chain, of the same form.
     ///
     /// # Errors
-    /// When a stage does not compile or no room was made.
+    /// When a kernel does not compile or no room was made.
     fn record<'a>(
         &'a self,
         recorder: &mut Recorder<'_>,
@@ -108,7 +108,7 @@ pub trait Appearance: Any + Send + Sync {
     /// while the frame's counters say that a list was too short.
     ///
     /// # Errors
-    /// When a stage does not compile or no room was made.
+    /// When a kernel does not compile or no room was made.
     fn record_backward(
         &self,
         recorder: &mut Recorder<'_>,
@@ -134,7 +134,7 @@ pub trait Appearance: Any + Send + Sync {
     /// Records what goes from the gradients of the splats to the parameters, before the Gaussians move.
     ///
     /// # Errors
-    /// When a stage does not compile or no room was made.
+    /// When a kernel does not compile or no room was made.
     fn record_gradients(
         &self,
         _gpu: &Gpu,
@@ -148,7 +148,7 @@ pub trait Appearance: Any + Send + Sync {
     /// moved.
     ///
     /// # Errors
-    /// When a stage does not compile or no room was made.
+    /// When a kernel does not compile or no room was made.
     fn record_step(&self, _recorder: &mut Recorder<'_>, _frame: &Frame) -> Result<()> {
         Ok(())
     }
@@ -235,7 +235,7 @@ impl Chain {
     /// for the loss.
     ///
     /// # Errors
-    /// When a stage does not compile or no room was made.
+    /// When a kernel does not compile or no room was made.
     pub fn record<'a>(
         &'a self,
         recorder: &mut Recorder<'_>,
@@ -254,7 +254,7 @@ impl Chain {
     /// Records the backward pass of [`Chain::record`], from the loss to the blended picture.
     ///
     /// # Errors
-    /// When a stage does not compile or no room was made.
+    /// When a kernel does not compile or no room was made.
     pub fn record_backward(
         &self,
         recorder: &mut Recorder<'_>,

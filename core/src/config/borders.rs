@@ -42,7 +42,7 @@ impl Default for BordersConfig {
 
 impl BordersConfig {
     /// Whether a job of `partitions` partitions has the task: a single partition has no borders.
-    pub fn is_refined(&self, partitions: usize) -> bool {
+    pub fn is_enabled_for(&self, partitions: usize) -> bool {
         self.enabled && partitions > 1
     }
 
@@ -104,8 +104,8 @@ mod tests {
     #[test]
     fn only_jobs_of_several_partitions_have_borders() {
         let on = BordersConfig { enabled: true, ..BordersConfig::default() };
-        assert!(on.is_refined(2) && !on.is_refined(1));
-        assert!(!BordersConfig::default().is_refined(2), "off is the default");
+        assert!(on.is_enabled_for(2) && !on.is_enabled_for(1));
+        assert!(!BordersConfig::default().is_enabled_for(2), "off is the default");
     }
 
     #[test]

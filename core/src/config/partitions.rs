@@ -45,7 +45,7 @@ impl WaterPartitions {
 impl WaterConfig {
     /// Whether partitions have their own tasks to refine the water. A single partition needs no consensus and
     /// refines its water itself.
-    pub fn is_refined(&self, partitions: u32) -> bool {
+    pub fn is_joint_for(&self, partitions: u32) -> bool {
         self.partitions == WaterPartitions::Joint && partitions > 1 && self.medium != Medium::None
     }
 
@@ -77,7 +77,7 @@ impl JobConfig {
     /// partitions. `None` if the run has one part. A run that exchanges both water and Gaussians does so
     /// once, at the later of the two points.
     pub fn exchange_at(&self, iterations: u32, partitions: u32) -> Option<u32> {
-        let water = self.water.is_refined(partitions).then(|| self.water.free_iterations(iterations));
+        let water = self.water.is_joint_for(partitions).then(|| self.water.free_iterations(iterations));
         let gaussians = self.partition.has_neighbours(partitions).then(|| {
             let first = (f64::from(iterations) * self.partition.neighbours_from).round() as u32;
             first.clamp(1, iterations.saturating_sub(1).max(1))
@@ -145,9 +145,9 @@ mod tests {
 
     #[test]
     fn only_partitions_under_water_refine_it() {
-        let refine = WaterConfig { partitions: WaterPartitions::Joint, ..WaterConfig::default() };
-        assert!(refine.is_refined(2) && !refine.is_refined(1));
-        assert!(!WaterConfig { medium: Medium::None, ..refine }.is_refined(2));
-        assert!(!WaterConfig::default().is_refined(2), "frozen is the default");
+        let joint = WaterConfig { partitions: WaterPartitions::Joint, ..WaterConfig::default() };
+        assert!(joint.is_joint_for(2) && !joint.is_joint_for(1));
+        assert!(!WaterConfig { medium: Medium::None, ..joint }.is_joint_for(2));
+        assert!(!WaterConfig::default().is_joint_for(2), "frozen is the default");
     }
 }

@@ -36,7 +36,7 @@ pub struct BlockTraining {
     pub sh_moment2: Option<wgpu::Buffer>,
     /// `[N]` vec4 of density control and, in z, of smoothing; see `project_backward.wgsl` and
     /// `smoothing.wgsl`.
-    pub refine: wgpu::Buffer,
+    pub density_sums: wgpu::Buffer,
     /// Sums of the bands of a picture that is rendered in several: `[N*3]` vec4, made when it is first
     /// needed.
     band_gradients: OnceLock<wgpu::Buffer>,
@@ -53,9 +53,14 @@ impl BlockTraining {
     pub fn arrays(&self, stride: u32) -> Vec<(&wgpu::Buffer, usize)> {
         let colour = 16 * stride as usize;
         match &self.sh_moment2 {
-            None => vec![(&self.moments, 64), (&self.sh_moment1, colour / 2), (&self.refine, 16)],
+            None => vec![(&self.moments, 64), (&self.sh_moment1, colour / 2), (&self.density_sums, 16)],
             Some(second) => {
-                vec![(&self.moments, 96), (&self.sh_moment1, colour), (second, colour), (&self.refine, 16)]
+                vec![
+                    (&self.moments, 96),
+                    (&self.sh_moment1, colour),
+                    (second, colour),
+                    (&self.density_sums, 16),
+                ]
             }
         }
     }
@@ -253,14 +258,14 @@ impl Blocks {
                 moments: rows("moments", 4)?,
                 sh_moment1: halves("sh_moment1", stride)?,
                 sh_moment2: None,
-                refine: rows("refine", 1)?,
+                density_sums: rows("density_sums", 1)?,
                 band_gradients: OnceLock::new(),
             }),
             Some(Moments::F32) => Some(BlockTraining {
                 moments: rows("moments", 6)?,
                 sh_moment1: rows("sh_moment1", stride)?,
                 sh_moment2: Some(rows("sh_moment2", stride)?),
-                refine: rows("refine", 1)?,
+                density_sums: rows("density_sums", 1)?,
                 band_gradients: OnceLock::new(),
             }),
         };
@@ -315,7 +320,7 @@ impl Blocks {
         Ok(all)
     }
 
-    /// Sets the number of Gaussians in trainable blocks; entries that are new must be written by a stage.
+    /// Sets the number of Gaussians in trainable blocks; entries that are new must be written by a kernel.
     pub fn set_trainable_total(&mut self, gpu: &Gpu, total: u32) {
         let mut left = total;
         for block in self.blocks.iter_mut().filter(|block| block.training.is_some()) {

@@ -4,8 +4,8 @@ use std::io::Write as _;
 use std::sync::Arc;
 
 use super::faults::Faults;
+use super::kernel::{Kernels, TileLayout};
 use super::memory::Ledger;
-use super::stage::{Stages, TileLayout};
 use crate::{CoreError, Result};
 
 /// Which adapter may be used, and how much of it.
@@ -82,7 +82,8 @@ pub fn numbered(adapters: &[AdapterSummary]) -> String {
 fn instance() -> wgpu::Instance {
     let mut descriptor = wgpu::InstanceDescriptor::new_without_display_handle();
     descriptor.backends = wgpu::Backends::PRIMARY;
-    // Indirect dispatches are clamped by our own `count_*` stages; wgpu's check would add a dispatch to each.
+    // Indirect dispatches are clamped by our own `count_*` kernels; wgpu's check would add a dispatch to
+    // each.
     descriptor.flags = wgpu::InstanceFlags::empty();
     wgpu::Instance::new(descriptor)
 }
@@ -127,13 +128,13 @@ pub fn limited_device_for_test(what: &str, memory_limit: Option<u64>) -> Option<
     }
 }
 
-/// A device with its queue and stages.
+/// A device with its queue and kernels.
 pub struct Gpu {
     summary: AdapterSummary,
     layout: TileLayout,
     pub(super) device: wgpu::Device,
     pub(super) queue: wgpu::Queue,
-    stages: Stages,
+    kernels: Kernels,
     timestamps: bool,
     shader_checks: bool,
     pub(super) faults: Arc<Faults>,
@@ -210,12 +211,12 @@ impl Gpu {
             tracing::warn!(adapter = %summary.name, "no GPU is used: this adapter runs on the CPU and is slow");
         }
         let ledger = Ledger::new(options.memory_limit);
-        let stages = Stages::default();
+        let kernels = Kernels::default();
         let shader_checks = options.shader_checks.unwrap_or(cfg!(debug_assertions));
         Ok(Arc::new(Self {
             summary,
             layout,
-            stages,
+            kernels,
             device,
             queue,
             timestamps,
@@ -253,8 +254,8 @@ impl Gpu {
         &self.queue
     }
 
-    pub(crate) fn stages(&self) -> &Stages {
-        &self.stages
+    pub(crate) fn kernels(&self) -> &Kernels {
+        &self.kernels
     }
 
     /// [`GpuOptions::shader_checks`], resolved.
@@ -267,7 +268,7 @@ impl Gpu {
         self.timestamps
     }
 
-    /// A zeroed buffer that stages read as a uniform and others write.
+    /// A zeroed buffer that kernels read as a uniform and others write.
     ///
     /// # Errors
     /// [`CoreError::OutOfMemory`] where there is no room.
@@ -292,7 +293,7 @@ impl Gpu {
     /// room.
     pub fn buffer(&self, label: &'static str, bytes: u64) -> Result<wgpu::Buffer> {
         // What was replaced by now is given back before there is something new.
-        self.stages.forget_bind_groups();
+        self.kernels.forget_bind_groups();
         self.streamed(label, bytes)
     }
 

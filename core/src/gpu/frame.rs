@@ -105,8 +105,8 @@ pub struct Frame {
     intersect_capacity: u32,
     gaussian_capacity: u32,
     limits: ListLimits,
-    /// In place of the refine array of frozen blocks: one row of zeros, no smoothing.
-    unrefined: wgpu::Buffer,
+    /// In place of `density_sums` of frozen blocks: one row of zeros, no smoothing.
+    no_density_sums: wgpu::Buffer,
     offsets: wgpu::Buffer,
     flag_scan: Scan,
     offset_scan: Scan,
@@ -136,7 +136,7 @@ impl Frame {
             gaussian_from_visible: words("gaussian_from_visible", visible, 1)?,
             segments: words("segments", visible, 2)?,
             visible_from_slot: words("visible_from_slot", intersections, 1)?,
-            unrefined: words("no refine", 4, 1)?,
+            no_density_sums: words("no density sums", 4, 1)?,
             offsets: words("intersect offsets", visible, 1)?,
             flag_scan: Scan::new(gpu, counter::GAUSSIANS, gaussians)?,
             offset_scan: Scan::new(gpu, counter::VISIBLE, visible)?,
@@ -277,7 +277,7 @@ impl Frame {
     /// counts and capacities here.
     ///
     /// # Errors
-    /// When a stage does not compile or targets are missing.
+    /// When a kernel does not compile or targets are missing.
     pub fn record_forward(
         &self,
         gpu: &Gpu,
@@ -308,7 +308,7 @@ impl Frame {
     /// short.
     ///
     /// # Errors
-    /// When a stage does not compile.
+    /// When a kernel does not compile.
     pub fn record_visibility(
         &self,
         gpu: &Gpu,
@@ -319,7 +319,7 @@ impl Frame {
         self.record_cull(gpu, recorder, blocks, &FrameUniform { visible_capacity: u32::MAX, ..*view })
     }
 
-    /// Records the stages up to the number of visible Gaussians, within the capacities that `view` names.
+    /// Records the kernels up to the number of visible Gaussians, within the capacities that `view` names.
     fn record_cull(
         &self,
         gpu: &Gpu,
@@ -353,7 +353,13 @@ impl Frame {
                     ("block", &block.uniform),
                     ("transforms", &block.transforms),
                     ("chunk_seen", &block.chunk_seen),
-                    ("refine", block.training.as_ref().map_or(&self.unrefined, |training| &training.refine)),
+                    (
+                        "density_sums",
+                        block
+                            .training
+                            .as_ref()
+                            .map_or(&self.no_density_sums, |training| &training.density_sums),
+                    ),
                     ("flags", &self.flags),
                 ],
             )?;
@@ -377,7 +383,7 @@ impl Frame {
     /// Records everything before the blending: what each tile sees, front to back.
     ///
     /// # Errors
-    /// When a stage does not compile or targets are missing.
+    /// When a kernel does not compile or targets are missing.
     pub fn record_lists(
         &self,
         gpu: &Gpu,
@@ -402,7 +408,13 @@ impl Frame {
                     ("block", &block.uniform),
                     ("transforms", &block.transforms),
                     ("sh_coeffs", &block.sh_coeffs),
-                    ("refine", block.training.as_ref().map_or(&self.unrefined, |training| &training.refine)),
+                    (
+                        "density_sums",
+                        block
+                            .training
+                            .as_ref()
+                            .map_or(&self.no_density_sums, |training| &training.density_sums),
+                    ),
                     ("flags", &self.flags),
                     counters,
                     ("projected", &self.projected),

@@ -4,7 +4,7 @@
 use bytemuck::{Pod, Zeroable};
 use glam::DVec3;
 
-use super::Show;
+use super::Output;
 use crate::memory::MAX_TILES;
 use crate::scene::{PinholeCamera, Pose};
 use crate::water::{ByDirection, RangeModulation, Water};
@@ -275,18 +275,18 @@ pub mod medium {
     pub const AS_SHOWN: u32 = 6;
     pub const OVER_BLACK: u32 = 7;
 
-    use super::Show;
+    use super::Output;
     use crate::config::Composition;
 
     /// The value with which a scene under water is rendered, to show this of it.
-    pub(crate) fn of(composition: Composition, show: Show) -> u32 {
-        match (composition, show) {
-            (Composition::GaussiansSrgb, Show::Seen) => PER_GAUSSIAN_SRGB,
-            (Composition::GaussiansSrgb, Show::Veil) => VEIL_SRGB,
-            (Composition::GaussiansLinear, Show::Seen) => PER_GAUSSIAN,
-            (Composition::GaussiansLinear, Show::Veil) => VEIL,
-            (Composition::GaussiansLinear, Show::Clear) | (Composition::PixelsLinear, _) => DECODED,
-            (_, Show::Clear) => NONE,
+    pub(crate) fn of(composition: Composition, output: Output) -> u32 {
+        match (composition, output) {
+            (Composition::GaussiansSrgb, Output::Underwater) => PER_GAUSSIAN_SRGB,
+            (Composition::GaussiansSrgb, Output::Backscatter) => VEIL_SRGB,
+            (Composition::GaussiansLinear, Output::Underwater) => PER_GAUSSIAN,
+            (Composition::GaussiansLinear, Output::Backscatter) => VEIL,
+            (Composition::GaussiansLinear, Output::Restored) | (Composition::PixelsLinear, _) => DECODED,
+            (_, Output::Restored) => NONE,
             (Composition::PixelsSrgb, _) => AS_SHOWN,
             (Composition::PixelsOverBlack, _) => OVER_BLACK,
         }

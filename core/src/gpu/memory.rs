@@ -104,7 +104,7 @@ impl Gpu {
     /// # Errors
     /// When the device failed.
     pub fn release_unused(&self) -> Result<()> {
-        self.stages().forget_bind_groups();
+        self.kernels().forget_bind_groups();
         self.wait()
     }
 

@@ -1,20 +1,20 @@
-//! The GPU: adapter and device, compute stages, and rendering of a model.
+//! The GPU: adapter and device, compute kernels, and rendering of a model.
 //!
-//! Everything is compute shaders of `shaders/`, one stage a file. Bindings are found by name (reflected with
-//! naga from the WGSL), so a stage and its call cannot drift apart silently.
+//! Everything is compute shaders of `shaders/`, one kernel a file. Bindings are found by name (reflected with
+//! naga from the WGSL), so a kernel and its call cannot drift apart silently.
 
 mod blocks;
 mod bounds;
 mod device;
 mod faults;
 mod frame;
+mod kernel;
 mod layout;
 mod memory;
 mod photograph;
 mod render;
 mod seams;
 mod sort;
-mod stage;
 mod workload;
 
 pub use blocks::{BLOCK_CAPACITY, Block, BlockTraining, Blocks, sh_stride};
@@ -23,6 +23,9 @@ pub use device::{
     AdapterSummary, Gpu, GpuOptions, adapters, device_for_test, limited_device_for_test, numbered,
 };
 pub use frame::{Frame, FrameTargets, ListLimits, Overflow};
+pub use kernel::{
+    Kernel, KernelTime, Recorder, Size, TileLayout, kernel_names, kernel_variants, shader_source,
+};
 pub(crate) use layout::water_rows;
 pub use layout::{
     BlockUniform, DbdrState, DbdrUniform, ExposureUniform, FilmUniform, FrameUniform, LossUniform,
@@ -30,8 +33,7 @@ pub use layout::{
 };
 pub use memory::{DeviceMemory, Spare};
 pub use photograph::{DeviceMap, DevicePhotograph};
-pub use render::{Rendered, Renderer, Show, WaterView};
+pub use render::{Output, Rendered, Renderer, WaterView};
 pub use seams::SeamRun;
 pub use sort::{Scan, Sort};
-pub use stage::{Recorder, Size, Stage, StageTime, TileLayout, shader_source, stage_names, stage_variants};
 pub use workload::Workload;

@@ -44,15 +44,15 @@ impl Rendered {
     }
 }
 
-/// What of a scene under water is shown.
+/// Which picture of a scene under water is rendered.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Show {
+pub enum Output {
     /// I: as the camera sees it.
-    Seen,
+    Underwater,
     /// J: without the water.
-    Clear,
+    Restored,
     /// B: the water's own light alone.
-    Veil,
+    Backscatter,
 }
 
 /// A water to render through.
@@ -67,16 +67,16 @@ pub struct WaterView {
     pub by_direction: Option<ByDirection>,
     /// Where they act, and how Gaussians are blended: as the model was trained.
     pub composition: Composition,
-    /// What is shown.
-    pub show: Show,
+    /// Which picture is rendered.
+    pub output: Output,
 }
 
 impl WaterView {
     /// The water that a model carries.
-    pub fn of_record(record: &WaterRecord, show: Show) -> Self {
+    pub fn of_record(record: &WaterRecord, output: Output) -> Self {
         let (water, refinement) = (record.water(), record.refinement);
         let (by_direction, composition) = (record.by_direction, record.composition);
-        Self { water, refinement, by_direction, composition, show }
+        Self { water, refinement, by_direction, composition, output }
     }
 
     /// The same as it is along `direction`, unit length, scene axes.
@@ -93,10 +93,10 @@ impl WaterView {
         let as_shown = !self.composition.blends_in_linear_light();
         let over_black = self.composition == Composition::PixelsOverBlack;
         let on_pixels = self.composition.acts_on_pixels();
-        if as_shown && (!on_pixels || self.show == Show::Clear) {
+        if as_shown && (!on_pixels || self.output == Output::Restored) {
             let open = b_inf.map(linear_to_srgb);
             return std::array::from_fn(|c| {
-                let behind = if self.show == Show::Clear { f64::from(background[c]) } else { open[c] };
+                let behind = if self.output == Output::Restored { f64::from(background[c]) } else { open[c] };
                 blended[c] + ((1.0 - alpha) * behind) as f32
             });
         }
@@ -118,12 +118,12 @@ impl WaterView {
                 (false, _) => 1.0,
             };
             let veil = b_inf[c] * (share - alpha * (-beta_b[c] * r).exp());
-            let light = match (self.show, on_pixels) {
-                (Show::Clear, _) => own + (1.0 - alpha) * background[c],
+            let light = match (self.output, on_pixels) {
+                (Output::Restored, _) => own + (1.0 - alpha) * background[c],
                 (_, false) => own + (1.0 - alpha) * b_inf[c],
                 _ if open => share * b_inf[c],
-                (Show::Seen, _) => own * (-beta_d[c] * r).exp() + veil,
-                (Show::Veil, _) => veil,
+                (Output::Underwater, _) => own * (-beta_d[c] * r).exp() + veil,
+                (Output::Backscatter, _) => veil,
             };
             linear_to_srgb(light) as f32
         })
@@ -139,11 +139,11 @@ pub struct Renderer {
     frame: Frame,
     /// Which Gaussian of the model lies where on the device.
     order: Vec<u32>,
-    way: Way,
+    options: RenderOptions,
 }
 
 /// How pictures are rendered.
-struct Way {
+struct RenderOptions {
     strip_tiles: u32,
     mip_filter: bool,
     water: Option<WaterView>,
@@ -162,15 +162,15 @@ impl Renderer {
         blocks.push_frozen(&gpu, model, &order)?;
         let count = model.len() as u32;
         let frame = Frame::new(&gpu, count, count.clamp(1024, 65_536), count.clamp(4096, 262_144))?;
-        let way = Way { strip_tiles: MAX_TILES, mip_filter: false, water: None, bands: 1 };
-        Ok(Self { gpu, blocks, recoloured: None, frame, order, way })
+        let options = RenderOptions { strip_tiles: MAX_TILES, mip_filter: false, water: None, bands: 1 };
+        Ok(Self { gpu, blocks, recoloured: None, frame, order, options })
     }
 
     /// Renders with or without the 2D filter of Mip-Splatting: as the model was trained
     /// ([`crate::ply::is_antialiased`]).
     #[must_use]
     pub fn with_mip_filter(mut self, mip_filter: bool) -> Self {
-        self.way.mip_filter = mip_filter;
+        self.options.mip_filter = mip_filter;
         self
     }
 
@@ -187,13 +187,13 @@ impl Renderer {
         if let Some(view) = &water {
             self.frame.set_water(&self.gpu, &view.water);
         }
-        self.way.water = water;
+        self.options.water = water;
     }
 
     /// The same renderer with strips of at most `tiles` tiles, but never less than a row of them: for devices
     /// with little memory.
     pub fn with_strip_tiles(mut self, tiles: u32) -> Self {
-        self.way.strip_tiles = self.way.strip_tiles.min(tiles);
+        self.options.strip_tiles = self.options.strip_tiles.min(tiles);
         self
     }
 
@@ -209,7 +209,7 @@ impl Renderer {
     /// # Errors
     /// When the device fails, or cannot bind what one tile needs.
     pub fn render(&mut self, camera: &PinholeCamera, pose: &Pose, background: [f32; 3]) -> Result<Rendered> {
-        draw(&self.gpu, &mut self.frame, &self.blocks, &mut self.way, (camera, pose), background)
+        draw(&self.gpu, &mut self.frame, &self.blocks, &mut self.options, (camera, pose), background)
     }
 
     /// The normals of `model`, which must be the one that was uploaded: for each pixel the unit direction of
@@ -273,9 +273,9 @@ impl Renderer {
             self.gpu.write(&block.sh_coeffs, 0, &rows);
         }
         // These are no colours: nothing is to be done to them.
-        let water = self.way.water.take();
-        let rendered = draw(&self.gpu, &mut self.frame, &blocks, &mut self.way, (camera, pose), [0.0; 3]);
-        self.way.water = water;
+        let water = self.options.water.take();
+        let rendered = draw(&self.gpu, &mut self.frame, &blocks, &mut self.options, (camera, pose), [0.0; 3]);
+        self.options.water = water;
         self.recoloured = Some(blocks);
         rendered
     }
@@ -286,15 +286,15 @@ fn draw(
     gpu: &Gpu,
     frame: &mut Frame,
     blocks: &Blocks,
-    way: &mut Way,
+    options: &mut RenderOptions,
     (camera, pose): (&PinholeCamera, &Pose),
     background: [f32; 3],
 ) -> Result<Rendered> {
     let view = FrameUniform {
-        background: if way.water.is_some() { [0.0; 3] } else { background },
-        medium: way.water.map_or(medium::NONE, |water| medium::of(water.composition, water.show)),
+        background: if options.water.is_some() { [0.0; 3] } else { background },
+        medium: options.water.map_or(medium::NONE, |water| medium::of(water.composition, water.output)),
         sh_degree: u32::from(blocks.sh_degree()),
-        mip_filter: u32::from(way.mip_filter),
+        mip_filter: u32::from(options.mip_filter),
         ..FrameUniform::of_camera(camera, pose, gpu.tile())
     };
     let pixels = camera.width as usize * camera.height as usize;
@@ -306,7 +306,7 @@ fn draw(
         range: Vec::with_capacity(pixels),
     };
     let tile = gpu.tile();
-    let rows = (way.strip_tiles / view.tiles[0].max(1)).max(1) * tile;
+    let rows = (options.strip_tiles / view.tiles[0].max(1)).max(1) * tile;
     for first in (0..camera.height).step_by(rows as usize) {
         let count = rows.min(camera.height - first);
         // The principal point moves with the strip; the bounds of the projection stay those of the whole
@@ -315,9 +315,9 @@ fn draw(
             principal: [view.principal[0], (camera.cy - f64::from(first)) as f32],
             ..view.with_size([camera.width, count], tile)
         };
-        draw_strip(gpu, frame, blocks, &mut way.bands, &strip, &mut picture)?;
+        draw_strip(gpu, frame, blocks, &mut options.bands, &strip, &mut picture)?;
     }
-    if let Some(water) = &way.water {
+    if let Some(water) = &options.water {
         let to_world = pose.rotation.inverse();
         for (i, rgb) in picture.rgb.iter_mut().enumerate() {
             // Directions cost as much as the rest, and most waters are the same in all of them.

@@ -36,7 +36,7 @@ impl Scan {
     /// Records the sum of `values`; `groups` as [`Scan::groups`] gives them.
     ///
     /// # Errors
-    /// When a stage does not compile.
+    /// When a kernel does not compile.
     pub fn record(
         &self,
         recorder: &mut Recorder<'_>,
@@ -115,7 +115,7 @@ impl Sort {
     /// histogram, as [`Sort::groups`] and [`Scan::groups`] give them.
     ///
     /// # Errors
-    /// When a stage does not compile.
+    /// When a kernel does not compile.
     pub fn record(
         &self,
         recorder: &mut Recorder<'_>,

@@ -23,7 +23,7 @@ pub struct BackwardBuffers<'a> {
 /// Records the backward pass of a view that [`Frame::record_forward`] rendered whole, and the step.
 ///
 /// # Errors
-/// When a stage does not compile or the frame has no targets.
+/// When a kernel does not compile or the frame has no targets.
 pub fn record_backward(
     gpu: &Gpu,
     recorder: &mut Recorder<'_>,
@@ -38,7 +38,7 @@ pub fn record_backward(
         appearance.record_gradients(gpu, recorder, splats)?;
     }
     for (index, block, training) in blocks.trainable() {
-        let stage = match training.kind() {
+        let kernel = match training.kind() {
             Moments::Compact => "project_backward",
             Moments::F32 => "project_backward_f32",
         };
@@ -48,7 +48,7 @@ pub fn record_backward(
             ("segments", &frame.segments),
             ("slot_gradients", buffers.slot_gradients),
         ];
-        record_step(recorder, stage, groups, frame, block, training, &sources, buffers.step)?;
+        record_step(recorder, kernel, groups, frame, block, training, &sources, buffers.step)?;
     }
     buffers.appearances.iter().try_for_each(|appearance| appearance.record_step(recorder, frame))
 }
@@ -60,7 +60,7 @@ pub fn record_backward(
 /// step follows when all are there. Each band is a submission, since its uniform is one.
 ///
 /// # Errors
-/// When a stage does not compile, the frame has no targets, or the device cannot hold the sums.
+/// When a kernel does not compile, the frame has no targets, or the device cannot hold the sums.
 pub fn record_backward_in_bands(
     gpu: &Gpu,
     recorder: &mut Recorder<'_>,
@@ -101,13 +101,13 @@ pub fn record_backward_in_bands(
         appearance.record_gradients(gpu, recorder, splats)?;
     }
     for (_, block, training) in blocks.trainable() {
-        let stage = match training.kind() {
+        let kernel = match training.kind() {
             Moments::Compact => "project_backward_bands",
             Moments::F32 => "project_backward_bands_f32",
         };
         let sources = [("band_gradients", training.band_gradients(gpu, block.capacity)?)];
         let groups = Size::Items(block.count, 64);
-        record_step(recorder, stage, groups, frame, block, training, &sources, buffers.step)?;
+        record_step(recorder, kernel, groups, frame, block, training, &sources, buffers.step)?;
     }
     for appearance in buffers.appearances {
         appearance.record_step(recorder, frame)?;
@@ -144,7 +144,7 @@ fn record_rasterize(
 
 fn record_step(
     recorder: &mut Recorder<'_>,
-    stage: &'static str,
+    kernel: &'static str,
     groups: Size<'_>,
     frame: &Frame,
     block: &Block,
@@ -162,12 +162,12 @@ fn record_step(
         ("sh_coeffs", &block.sh_coeffs),
         ("moments", &training.moments),
         ("sh_moment1", &training.sh_moment1),
-        ("refine", &training.refine),
+        ("density_sums", &training.density_sums),
         ("water", &frame.water),
     ];
     bound.extend_from_slice(sources);
     if let Some(second) = &training.sh_moment2 {
         bound.push(("sh_moment2", second));
     }
-    recorder.dispatch(stage, groups, &bound)
+    recorder.dispatch(kernel, groups, &bound)
 }

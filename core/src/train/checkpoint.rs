@@ -105,7 +105,7 @@ fn take_network(trainer: &mut Trainer, state: Option<&[u8]>) -> Result<()> {
     if let (Some(predictor), Some(state)) = (&mut trainer.predictor, state) {
         predictor.restore(state)?;
         if let (Some(errors), Some(medium)) = (predictor.standard_error(), trainer.appearances.water_mut()) {
-            medium.tell_standard_error(errors);
+            medium.set_standard_error(errors);
         }
     }
     Ok(())

@@ -149,14 +149,14 @@ impl Trainer {
             gpu: &self.gpu,
             settings: settings(&self.config, Some(&medium)),
             medium: Some(&medium),
-            views: self.truth.views().len() as u32,
+            views: self.targets.views().len() as u32,
             blocks: self.blocks.trainable().count() as u32,
         })?;
         self.schedule = Schedule::new(&self.config, Some(&medium));
         if let Some(water) = self.appearances.water() {
             water.give_to(&self.gpu, &self.frame);
         }
-        for view in self.truth.views() {
+        for view in self.targets.views() {
             self.appearances.prepare(&self.gpu, [view.camera.width, view.camera.height])?;
         }
         self.gpu.wait()

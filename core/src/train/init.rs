@@ -3,7 +3,7 @@
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
 
 use super::MediumRun;
-use super::far_field::far_field;
+use super::background::background_gaussians;
 use crate::config::{Strategy, TrainConfig};
 use crate::gaussians::{Gaussians, MAX_SH_COEFFS, SH_C0};
 use crate::rng::{Stream, permutation};
@@ -39,7 +39,8 @@ pub fn initial_gaussians(
     let shows_open_water = medium.is_some_and(|medium| medium.shows_open_water == Some(true));
     let shell =
         if shows_open_water { 0 } else { config.background_gaussians.min(config.max_gaussians / FAR_SHARE) };
-    let far = far_field(points, views, config.sh_degree, shell, medium.map(|medium| &medium.water));
+    let far =
+        background_gaussians(points, views, config.sh_degree, shell, medium.map(|medium| &medium.water));
     let room = config.max_gaussians - far.len() as u32;
     let mut model = limit(gaussians_from_points(points, opacity, config.sh_degree)?, room, config.seed);
     (0..far.len()).for_each(|index| model.push_from(&far, index));
@@ -138,7 +139,7 @@ mod tests {
         for cap in [16, 500, 1000, 1600, 5000] {
             let config = TrainConfig { max_gaussians: cap, sh_degree: 1, ..TrainConfig::default() };
             let model = initial_gaussians(&points, &views, &config, None).unwrap();
-            let far = far_field(&points, &views, 1, cap / FAR_SHARE, None);
+            let far = background_gaussians(&points, &views, 1, cap / FAR_SHARE, None);
             assert!(!far.is_empty() || cap < 100, "a cap of {cap} has no far field");
             assert_eq!(model.len(), (cap as usize).min(1600 + far.len()), "at a cap of {cap}");
             assert!(model.means.ends_with(&far.means));

@@ -2,11 +2,11 @@
 
 use std::sync::Arc;
 
-use super::truth::Key;
+use super::target_images::Key;
 use super::{BackwardBuffers, Trainer, record_backward, record_backward_in_bands};
 use crate::Result;
 use crate::appearance::chain::{Gradients, Iteration};
-use crate::gpu::{DevicePhotograph, FrameUniform, Recorder, StageTime, StepUniform, Workload};
+use crate::gpu::{DevicePhotograph, FrameUniform, KernelTime, Recorder, StepUniform, Workload};
 
 impl Trainer {
     /// Runs to iteration `end`, growing lists on the way.
@@ -42,14 +42,14 @@ impl Trainer {
 
     /// The view of an iteration: its index among the views and how often its picture is halved.
     pub(super) fn view_of(&mut self, iteration: u32) -> Key {
-        let index = self.truth.view_at(iteration);
+        let index = self.targets.view_at(iteration);
         let progress = self.schedule.progress(iteration);
-        (index, self.schedule.level(progress, &self.truth.views()[index].camera))
+        (index, self.schedule.level(progress, &self.targets.views()[index].camera))
     }
 
     /// A uniform of the size of what [`Trainer::view_of`] gives.
     pub(super) fn picture_of(&self, (index, level): Key) -> FrameUniform {
-        let camera = &self.truth.views()[index].camera;
+        let camera = &self.targets.views()[index].camera;
         let size = [camera.width, camera.height].map(|side| (side >> level).max(1));
         FrameUniform::default().with_size(size, self.gpu.tile())
     }
@@ -58,12 +58,12 @@ impl Trainer {
     fn record(&mut self, recorder: &mut Recorder<'_>, iteration: u32) -> Result<()> {
         let progress = self.schedule.progress(iteration);
         let key = self.view_of(iteration);
-        for next in (iteration + 1..self.config.iterations).take(self.truth.ahead() as usize) {
+        for next in (iteration + 1..self.config.iterations).take(self.targets.ahead() as usize) {
             let key = self.view_of(next);
-            self.truth.expect(key);
+            self.targets.expect(key);
         }
-        let photograph = self.truth.load(&self.gpu, key)?;
-        let view = &self.truth.views()[key.0];
+        let photograph = self.targets.load(&self.gpu, key)?;
+        let view = &self.targets.views()[key.0];
         let camera = view.camera.resized(photograph.size[0], photograph.size[1]);
         let frame = FrameUniform {
             sh_degree: self.schedule.sh_degree(progress),
@@ -133,7 +133,7 @@ impl Trainer {
             number,
             iterations: self.config.iterations,
             view: view as u32,
-            views: self.truth.views().len() as u32,
+            views: self.targets.views().len() as u32,
             level,
             is_predicted,
         }
@@ -157,7 +157,7 @@ impl Trainer {
     ///
     /// # Errors
     /// When a photograph cannot be read or the device fails.
-    pub fn time_iteration(&mut self) -> Result<Vec<StageTime>> {
+    pub fn time_iteration(&mut self) -> Result<Vec<KernelTime>> {
         let refine_at = self.schedule.next_refine(self.iteration);
         let predict_at = self.next_prediction();
         loop {
@@ -172,7 +172,7 @@ impl Trainer {
                         self.predict_water()?;
                     }
                     if self.iteration == refine_at && self.iteration < self.config.iterations {
-                        self.refine()?;
+                        self.densify()?;
                     }
                     return Ok(times);
                 }

@@ -123,7 +123,7 @@ impl Loss {
     /// Records the loss between `image` (the render) and `truth`.
     ///
     /// # Errors
-    /// When a stage does not compile or no room was made.
+    /// When a kernel does not compile or no room was made.
     pub fn record(
         &self,
         gpu: &Gpu,

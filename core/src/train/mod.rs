@@ -6,10 +6,10 @@
 //! nothing since), and decides on density from numbers read back at fixed iterations. So the result depends
 //! on the run, the seed and the device alone: not on timing, capacities, batches or interruptions.
 
+mod background;
 mod backward;
 mod checkpoint;
 mod density;
-mod far_field;
 mod handover;
 mod held_out;
 mod init;
@@ -22,7 +22,7 @@ mod schedule;
 mod smoothing;
 mod start;
 mod surfaces;
-mod truth;
+mod target_images;
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -54,7 +54,7 @@ pub use smoothing::smoothed;
 pub use start::{StartingWater, clear_points, starting_water, with_ray_maps};
 use surfaces::Surfaces;
 pub use surfaces::surface_points;
-use truth::Truth;
+use target_images::TargetImages;
 
 /// One run: what to train, on what, for how long.
 pub struct TrainRun {
@@ -109,7 +109,7 @@ pub struct Trainer {
     extent: f32,
     /// Digest of everything that decides the result; a checkpoint belongs to it.
     run_digest: [u8; 32],
-    truth: Truth,
+    targets: TargetImages,
     blocks: Blocks,
     frame: Frame,
     loss: Loss,
@@ -199,7 +199,7 @@ impl Trainer {
             appearances,
             predictor,
             surfaces,
-            truth: Truth::new(views, config.seed, config.prefetch_threads).gives_way(&gpu),
+            targets: TargetImages::new(views, config.seed, config.prefetch_threads).gives_way(&gpu),
             initial: focus.len() as u32,
             gpu,
             config,
@@ -241,7 +241,7 @@ impl Trainer {
                 self.predict_water()?;
             }
             if self.iteration == refine_at && self.iteration < self.config.iterations {
-                self.refine()?;
+                self.densify()?;
             }
         }
         Ok(self.progress())

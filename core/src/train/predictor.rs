@@ -166,7 +166,7 @@ impl Predictor {
     /// for `seen`.
     fn start(&mut self, learned: Option<(DepthMap, [f32; 9])>, seen: Seen) -> Result<()> {
         let (network, config, unit) = (Arc::clone(&self.network), self.config.clone(), self.unit as f32);
-        // Shared with the thread, so that it is still here where the system gives none.
+        // The thread gets a clone, so that this one is left when the system cannot start a thread.
         let task = Arc::new((learned, seen));
         let work = {
             let task = Arc::clone(&task);

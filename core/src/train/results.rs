@@ -2,7 +2,7 @@
 
 use super::{DeviceMedium, Exposures, Film, FilmEmbedding, MediumRun, MemoryUse, Predictor, Trainer};
 use crate::Result;
-use crate::gpu::{Blocks, Show, WaterView};
+use crate::gpu::{Blocks, Output, WaterView};
 use crate::water::{Water, WaterRecord};
 
 impl Trainer {
@@ -56,7 +56,7 @@ impl Trainer {
         let water = medium.water(&self.gpu, &self.frame)?;
         let refinement = medium.refinement(&self.gpu, &self.frame)?;
         let MediumRun { by_direction, composition, .. } = *medium.run();
-        Ok(Some(WaterView { water, refinement, by_direction, composition, show: Show::Seen }))
+        Ok(Some(WaterView { water, refinement, by_direction, composition, output: Output::Underwater }))
     }
 
     /// Steps of the water, and of the network that predicts it, that were left out since a gradient was not

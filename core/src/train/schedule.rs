@@ -11,9 +11,9 @@ use crate::scene::PinholeCamera;
 pub(super) struct Schedule {
     config: TrainConfig,
     /// Density is decided every so many iterations after the first of these two, up to the second.
-    refine_every: u32,
-    refine_from: u32,
-    refine_last: u32,
+    densify_every: u32,
+    densify_from: u32,
+    densify_last: u32,
     /// Iterations between two resets of opacities; 0: none.
     reset_every: u32,
     /// Of the water, where the run has one.
@@ -30,9 +30,9 @@ impl Schedule {
         let (first, last) = (iterations * f64::from(from), iterations * f64::from(until));
         let every = ((last - first) / f64::from(config.refine_steps.max(1))).round();
         Self {
-            refine_every: (every as u32).max(1),
-            refine_from: first as u32,
-            refine_last: last as u32,
+            densify_every: (every as u32).max(1),
+            densify_from: first as u32,
+            densify_last: last as u32,
             reset_every: if reset > 0.0 {
                 ((iterations * f64::from(reset)).round() as u32).max(1)
             } else {
@@ -50,30 +50,30 @@ impl Schedule {
 
     /// First iteration after `iteration` at whose start density is decided or opacities are reset.
     pub(super) fn next_refine(&self, iteration: u32) -> u32 {
-        let refine = (iteration.max(self.refine_from) - self.refine_from) / self.refine_every + 1;
-        let refine = self.refine_from.saturating_add(refine.saturating_mul(self.refine_every));
+        let densify = (iteration.max(self.densify_from) - self.densify_from) / self.densify_every + 1;
+        let densify = self.densify_from.saturating_add(densify.saturating_mul(self.densify_every));
         let reset = iteration.checked_div(self.reset_every).map(|n| (n + 1) * self.reset_every);
-        let refine = if self.refines_at(refine) { refine } else { u32::MAX };
-        refine.min(reset.filter(|&reset| self.resets_at(reset)).unwrap_or(u32::MAX))
+        let densify = if self.densifies_at(densify) { densify } else { u32::MAX };
+        densify.min(reset.filter(|&reset| self.resets_at(reset)).unwrap_or(u32::MAX))
     }
 
     /// Whether density is decided at the start of an iteration.
-    pub(super) fn refines_at(&self, iteration: u32) -> bool {
+    pub(super) fn densifies_at(&self, iteration: u32) -> bool {
         self.config.refine_steps > 0
-            && (self.refine_from + 1..=self.refine_last).contains(&iteration)
-            && (iteration - self.refine_from).is_multiple_of(self.refine_every)
+            && (self.densify_from + 1..=self.densify_last).contains(&iteration)
+            && (iteration - self.densify_from).is_multiple_of(self.densify_every)
     }
 
     /// Whether density is decided at the start of an iteration, and never again.
     pub(super) fn decides_last_at(&self, iteration: u32) -> bool {
-        self.refines_at(iteration) && iteration + self.refine_every > self.refine_last
+        self.densifies_at(iteration) && iteration + self.densify_every > self.densify_last
     }
 
     /// Whether opacities are reset at the start of an iteration: not at the end of densification (3DGS).
     pub(super) fn resets_at(&self, iteration: u32) -> bool {
         self.config.refine_steps > 0
             && self.reset_every > 0
-            && (1..self.refine_last).contains(&iteration)
+            && (1..self.densify_last).contains(&iteration)
             && iteration.is_multiple_of(self.reset_every)
     }
 
@@ -129,7 +129,7 @@ impl Schedule {
         let left = interpolate_log(1.0, c.anneal_to, falling);
         let (opacity_reg, scale_reg, noise) = match c.strategy {
             // What fades now is relocated no more.
-            Strategy::Mcmc if progress >= self.progress(self.refine_last) => (0.0, 0.0, c.mean_noise),
+            Strategy::Mcmc if progress >= self.progress(self.densify_last) => (0.0, 0.0, c.mean_noise),
             Strategy::Mcmc => (c.loss_factor * c.opacity_reg, c.loss_factor * c.scale_reg, c.mean_noise),
             Strategy::Classic => (0.0, 0.0, 0.0),
         };
@@ -187,14 +187,14 @@ mod tests {
     fn classic_refines_and_resets_at_the_shares_of_3dgs_and_has_no_weights_nor_noise() {
         let config = TrainConfig { strategy: Strategy::Classic, refine_steps: 145, ..config(30_000, 5000) };
         let schedule = Schedule::new(&config, None);
-        let (mut refines, mut resets, mut at) = (Vec::new(), Vec::new(), 0);
+        let (mut densifies, mut resets, mut at) = (Vec::new(), Vec::new(), 0);
         while schedule.next_refine(at) != u32::MAX {
             at = schedule.next_refine(at);
-            assert!(schedule.refines_at(at) || schedule.resets_at(at), "nothing is due at {at}");
-            refines.extend(schedule.refines_at(at).then_some(at));
+            assert!(schedule.densifies_at(at) || schedule.resets_at(at), "nothing is due at {at}");
+            densifies.extend(schedule.densifies_at(at).then_some(at));
             resets.extend(schedule.resets_at(at).then_some(at));
         }
-        assert_eq!(refines, (6..=150).map(|n| 100 * n).collect::<Vec<u32>>());
+        assert_eq!(densifies, (6..=150).map(|n| 100 * n).collect::<Vec<u32>>());
         assert_eq!(resets, [3000, 6000, 9000, 12_000]);
         assert_eq!([2999, 3000, 3001].map(|at| schedule.was_reset(at)), [false, false, true]);
         let step = schedule.rates(0.1, 2.0);

@@ -35,7 +35,7 @@ impl Trainer {
         if !self.config.mip_filter {
             return Ok(());
         }
-        let views = views_on_device(&self.gpu, self.truth.views())?;
+        let views = views_on_device(&self.gpu, self.targets.views())?;
         let mut recorder = Recorder::new(&self.gpu);
         for (_, block, training) in self.blocks.trainable() {
             recorder.dispatch(
@@ -45,7 +45,7 @@ impl Trainer {
                     ("block", &block.uniform),
                     ("transforms", &block.transforms),
                     ("views", &views),
-                    ("refine", &training.refine),
+                    ("density_sums", &training.density_sums),
                 ],
             )?;
         }
@@ -57,8 +57,8 @@ impl Trainer {
     pub(super) fn smoothing(&self) -> Result<Vec<f32>> {
         let mut all = Vec::new();
         for (_, block, training) in self.blocks.trainable() {
-            let refine: Vec<[f32; 4]> = self.gpu.read(&training.refine, 0, block.count as usize)?;
-            all.extend(refine.iter().map(|row| row[2]));
+            let rows: Vec<[f32; 4]> = self.gpu.read(&training.density_sums, 0, block.count as usize)?;
+            all.extend(rows.iter().map(|row| row[2]));
         }
         Ok(all)
     }

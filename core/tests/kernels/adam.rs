@@ -4,7 +4,7 @@ use fathom_core::config::Moments;
 use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::{Blocks, StepUniform};
 use fathom_core::rng::{Stream, random_bits};
-use fathom_twins::{AdamState, Gaussians64, LearningRates, adam, adam_compact, haste, samples};
+use fathom_twins::{AdamState, Gaussians64, LearningRates, adam, adam_compact, lr_scale, samples};
 
 use crate::device::{assert_same_bits, device, poison};
 use crate::view::{ImageGradients, Scene, View, gradients_only};
@@ -108,8 +108,8 @@ fn compare_kind(
         let (mut v_model, seen) = gradients(&gpu, &now, &v);
         unseen.iter_mut().zip(&seen).for_each(|(unseen, seen)| *unseen &= !seen);
         regularise(&Gaussians64::from(&now.model), &mut v_model, view.visible().len(), &seen);
-        let haste = if step.trainable > 0 { haste(model.len(), view.visible().len()) } else { 1.0 };
-        let rates = RATES.hastened(haste);
+        let lr_scale = if step.trainable > 0 { lr_scale(model.len(), view.visible().len()) } else { 1.0 };
+        let rates = RATES.scaled(lr_scale);
         twin(&mut model, &v_model, &mut state, &seen, &rates);
         view.backward(&v, step);
         let kernel = Gaussians64::from(&view.blocks.download(&gpu).unwrap());
@@ -168,7 +168,7 @@ fn a_view_that_sees_little_takes_the_longer_steps_of_the_twin_in_all_but_scales_
     let step = StepUniform { trainable, ..step() };
     if let Some(gpu) = device() {
         let seen = View::render(&gpu, &scene).visible().len();
-        assert!((2.0..5.0).contains(&haste(scene.model.len(), seen)), "{seen} are seen");
+        assert!((2.0..5.0).contains(&lr_scale(scene.model.len(), seen)), "{seen} are seen");
     }
     compare_at_least("longer steps", &scene, &step, 6, 300, |_, _, _, _| {});
 }

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use fathom_core::CoreError;
 use fathom_core::config::{Blend, Composition, DbdrConfig, DbdrMode, Medium, WaterConfig};
-use fathom_core::gpu::{Blocks, Frame, Gpu, Recorder, Renderer, Show, WaterView, medium};
+use fathom_core::gpu::{Blocks, Frame, Gpu, Output, Recorder, Renderer, WaterView, medium};
 use fathom_core::rng::{Stream, uniform_at};
 use fathom_core::train::{DeviceMedium, MediumRun, Trainer, WaterStep};
 use fathom_core::water::{RangeModulation, Water, WaterRecord};
@@ -248,12 +248,12 @@ fn a_renderer_of_the_record_shows_what_the_trainer_compares() {
         let record = water.record_of(&gpu, &view.frame, 0.5).unwrap();
         let record = WaterRecord::among(&[record.to_comment().unwrap()]).unwrap().unwrap();
         assert_eq!(record.refinement, Some(some_refinement(431)));
-        let rendered = |show| {
-            let water = WaterView::of_record(&record, show);
+        let rendered = |output| {
+            let water = WaterView::of_record(&record, output);
             let mut renderer = Renderer::new(Arc::clone(&gpu), &scene.model).unwrap().with_water(Some(water));
             renderer.render(&scene.camera, &scene.pose, [0.0; 3]).unwrap()
         };
-        let picture = rendered(Show::Seen);
+        let picture = rendered(Output::Underwater);
         for (i, (trained, shown)) in seen.iter().zip(&picture.rgb).enumerate() {
             for c in 0..3 {
                 // A fortieth of a step of 8 bits: f32 against f64, and another order of equal depths.
@@ -267,7 +267,7 @@ fn a_renderer_of_the_record_shows_what_the_trainer_compares() {
             }
         }
         // The water's own light, by the twin.
-        let veil = rendered(Show::Veil);
+        let veil = rendered(Output::Backscatter);
         for (i, shown) in veil.rgb.iter().enumerate() {
             let [alpha, range] = [veil.alpha[i], veil.range[i]].map(f64::from);
             let twin = form_refined(
@@ -330,7 +330,7 @@ fn maps_fit_a_water_that_constants_cannot() {
         refinement: Some(refinement),
         by_direction: None,
         composition: Composition::PixelsLinear,
-        show: Show::Seen,
+        output: Output::Underwater,
     };
     let wet = sunk(&gpu, view);
     let loss = |mode: DbdrMode| {

@@ -26,16 +26,16 @@ fn statistics_are_opacity_mean_gradients_and_size_and_start_anew() {
     let (_, block, training) = blocks.trainable().next().unwrap();
     let sums: Vec<[f32; 4]> =
         (0..200).map(|i| [0.5 * i as f32, (i % 4) as f32, 0.3, 0.1 * i as f32]).collect();
-    gpu.write(&training.refine, 0, &sums);
+    gpu.write(&training.density_sums, 0, &sums);
     let stats = storage(&gpu, &[[f32::NAN; 4]; 200]);
     let mut recorder = Recorder::new(&gpu);
     let buffers = [
         ("block", &block.uniform),
         ("transforms", &block.transforms),
-        ("refine", &training.refine),
+        ("density_sums", &training.density_sums),
         ("stats", &stats),
     ];
-    recorder.dispatch("refine_stats", Size::Items(200, 64), &buffers).unwrap();
+    recorder.dispatch("density_stats", Size::Items(200, 64), &buffers).unwrap();
     recorder.submit();
     let stats: Vec<[f32; 4]> = gpu.read(&stats, 0, 200).unwrap();
     for (i, found) in stats.iter().enumerate() {
@@ -53,7 +53,7 @@ fn statistics_are_opacity_mean_gradients_and_size_and_start_anew() {
             );
         }
     }
-    let after: Vec<f32> = gpu.read(&training.refine, 0, 800).unwrap();
+    let after: Vec<f32> = gpu.read(&training.density_sums, 0, 800).unwrap();
     assert!(after.chunks(4).all(|row| row == [0.0, 0.0, 0.3, 0.0]), "only the smoothing stays");
 }
 
@@ -317,7 +317,7 @@ fn a_gaussian_is_smoothed_by_the_finest_sampling_of_the_views_that_see_it() {
     let model = samples::random(145, 300, 0);
     let blocks = block_of(&gpu, &model, 300);
     let (_, block, training) = blocks.trainable().next().unwrap();
-    gpu.write(&training.refine, 0, &[[1.0_f32, 2.0, 3.0, 4.0]; 300]);
+    gpu.write(&training.density_sums, 0, &[[1.0_f32, 2.0, 3.0, 4.0]; 300]);
     // Long and short lenses, one of them among the Gaussians.
     let mut views: Vec<_> = [3.0, 2.0, 0.2].map(|away| samples::off_centre_view(75, 53, away)).to_vec();
     views[1].0.fx *= 3.0;
@@ -333,12 +333,12 @@ fn a_gaussian_is_smoothed_by_the_finest_sampling_of_the_views_that_see_it() {
         ("block", &block.uniform),
         ("transforms", &block.transforms),
         ("views", &listed),
-        ("refine", &training.refine),
+        ("density_sums", &training.density_sums),
     ];
     let mut recorder = Recorder::new(&gpu);
     recorder.dispatch("smoothing", Size::Items(300, 64), &buffers).unwrap();
     recorder.submit();
-    let found: Vec<[f32; 4]> = gpu.read(&training.refine, 0, 300).unwrap();
+    let found: Vec<[f32; 4]> = gpu.read(&training.density_sums, 0, 300).unwrap();
     let mut by_views = [0; 4];
     for (index, row) in found.iter().enumerate() {
         assert_eq!([row[0], row[1], row[3]], [1.0, 2.0, 4.0], "the rest of row {index}");

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use fathom_core::config::{Composition, FilmConfig, TrainConfig, WaterConfig};
-use fathom_core::gpu::{Gpu, ListLimits, Recorder, Renderer, Show, WaterView, counter};
+use fathom_core::gpu::{Gpu, ListLimits, Output, Recorder, Renderer, WaterView, counter};
 use fathom_core::metrics::{psnr, quantised};
 use fathom_core::rng::{Stream, uniform_at};
 use fathom_core::train::{FILM_UNITS, Film, FilmStep, TrainRun, Trainer};
@@ -165,8 +165,13 @@ const WATER: Water =
 /// Eighteen photographs under water, every other one at six tenths of the brightness.
 fn uneven(gpu: &Arc<Gpu>) -> InMemory {
     let composition = Composition::PixelsSrgb;
-    let view =
-        WaterView { water: WATER, refinement: None, by_direction: None, composition, show: Show::Seen };
+    let view = WaterView {
+        water: WATER,
+        refinement: None,
+        by_direction: None,
+        composition,
+        output: Output::Underwater,
+    };
     darkened(&sunk(gpu, view), |i| if i % 2 == 0 { 0.6 } else { 1.0 })
 }
 

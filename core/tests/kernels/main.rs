@@ -1,6 +1,6 @@
 //! Every kernel of `shaders/` on a real adapter against its f64 twin of `fathom_twins`.
 //!
-//! Stage by stage, a twin is fed with what the kernels gave for the stage before, so that tolerances need to
+//! Kernel by stage, a twin is fed with what the kernels gave for the stage before, so that tolerances need to
 //! cover one stage only. They come from the forward error bound of the formula at hand, with the constants of
 //! `device.rs`; where blending has an edge (alpha of 1/255, the end of a ray, the cap), what lies within the
 //! bound of it is counted. Runs on a CPU adapter too (lavapipe), about a minute on two cores: pictures are

@@ -4,8 +4,8 @@ use std::mem::offset_of;
 
 use fathom_core::gpu::{
     BlockUniform, DbdrState, DbdrUniform, ExposureUniform, FilmUniform, FrameUniform, LossUniform,
-    MediumUniform, PriorsUniform, StepUniform, TileLayout, WaterState, WaterUniform, shader_source,
-    stage_names,
+    MediumUniform, PriorsUniform, StepUniform, TileLayout, WaterState, WaterUniform, kernel_names,
+    shader_source,
 };
 
 /// Asserts that struct `name` of `stage` has the size and the offsets of its mirror.
@@ -192,7 +192,7 @@ fn the_table_of_stages_lists_exactly_the_stages() {
     let readme = std::fs::read_to_string(format!("{folder}/README.md")).unwrap();
     let mut listed: Vec<&str> =
         readme.lines().filter_map(|line| line.strip_prefix("| `")?.split('`').next()).collect();
-    let mut stages: Vec<&str> = stage_names().collect();
+    let mut stages: Vec<&str> = kernel_names().collect();
     let mut files: Vec<String> = std::fs::read_dir(folder)
         .unwrap()
         .filter_map(|entry| Some(entry.ok()?.file_name().to_str()?.strip_suffix(".wgsl")?.to_owned()))

@@ -103,14 +103,14 @@ impl View {
         let size = |i: u32| scene.model.log_scales[i as usize].iter().copied().fold(f32::MIN, f32::max).exp();
         let width = |i| if i % 3 == 0 { 0.0 } else { 2.0 * size(i) * uniform_at(151, Stream::Test, i, 0) };
         let rows: Vec<[f32; 4]> = (0..block.count).map(|i| [0.0, 0.0, width(i), 0.0]).collect();
-        gpu.write(&training.refine, 0, &rows);
+        gpu.write(&training.density_sums, 0, &rows);
         Self::render_blocks(gpu, &scene.clone().filtered(), blocks)
     }
 
     /// How far each trainable Gaussian is smoothed.
     pub fn smoothing(&self) -> Vec<f32> {
         let of_block = |(_, block, training): (_, &Block, &BlockTraining)| -> Vec<f32> {
-            let rows: Vec<[f32; 4]> = self.gpu.read(&training.refine, 0, block.count as usize).unwrap();
+            let rows: Vec<[f32; 4]> = self.gpu.read(&training.density_sums, 0, block.count as usize).unwrap();
             rows.iter().map(|row| row[2]).collect()
         };
         self.blocks.trainable().flat_map(of_block).collect()

@@ -3,7 +3,7 @@
 
 use fathom_core::config::Composition;
 use fathom_core::gaussians::Gaussians;
-use fathom_core::gpu::{Gpu, Renderer, Show, WaterView};
+use fathom_core::gpu::{Gpu, Output, Renderer, WaterView};
 use fathom_core::metrics::{psnr, quantised};
 use fathom_core::viewer_colours::ViewerColours;
 use fathom_core::views::{PackedImage, TrainView};
@@ -37,7 +37,7 @@ fn a_model_blended_in_linear_light_looks_the_same_in_viewers_with_other_colours_
         refinement: None,
         by_direction: None,
         composition: Composition::PixelsLinear,
-        show: Show::Clear,
+        output: Output::Restored,
     };
     let find = |iterations| {
         let (mut told, views) = (Vec::new(), views.clone());

@@ -9,7 +9,7 @@ use fathom_core::config::{
 };
 use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::{
-    Blocks, Frame, FrameUniform, Gpu, Recorder, Renderer, Show, StepUniform, WaterView, medium,
+    Blocks, Frame, FrameUniform, Gpu, Output, Recorder, Renderer, StepUniform, WaterView, medium,
 };
 use fathom_core::metrics::{psnr, quantised};
 use fathom_core::rng::{Stream, uniform_at};
@@ -18,8 +18,8 @@ use fathom_core::train::{DeviceMedium, MediumRun, TrainRun, Trainer, WaterStep};
 use fathom_core::views::{InMemory, TrainView};
 use fathom_core::water::{ByDirection, Water};
 use fathom_twins::{
-    Blended, Gaussians64, SplatGradient, WaterState, encode, form, form_backward, haste_under_water,
-    in_water, in_water_backward, project_backward, project_forward,
+    Blended, Gaussians64, SplatGradient, WaterState, encode, form, form_backward, in_water,
+    in_water_backward, lr_scale_under_water, project_backward, project_forward,
     samples::{self, off_centre_view},
 };
 
@@ -365,7 +365,7 @@ fn the_constant_colour_moves_faster_the_less_is_seen_of_it_and_higher_bands_as_i
         let (mut compared, mut fastest) = (0, 1.0_f64);
         for (id, splat) in twin.iter().enumerate() {
             let Some(splat) = splat else { continue };
-            let haste = haste_under_water(&WATER, splat.rgb.map(|s| s.max(0.0)), splat.range);
+            let lr_scale = lr_scale_under_water(&WATER, splat.rgb.map(|s| s.max(0.0)), splat.range);
             for p in 11..after.parameters() {
                 let moved = (after.parameter(id, p) - before.parameter(id, p)).abs();
                 // No pixel shows it, or its colour is cut off at 0.
@@ -373,11 +373,11 @@ fn the_constant_colour_moves_faster_the_less_is_seen_of_it_and_higher_bands_as_i
                     continue;
                 }
                 let c = (p - 11) % 3;
-                let expected = if p < 14 { RATES[0] * haste[c] } else { RATES[1] };
+                let expected = if p < 14 { RATES[0] * lr_scale[c] } else { RATES[1] };
                 let name = Gaussians64::parameter_name(p);
                 // The slopes are powers in f32, and coefficients of order 1 have a spacing of 1e-7.
                 assert!((moved / expected - 1.0).abs() < 2e-3, "{name} of {id}: {moved}, not {expected}");
-                (compared, fastest) = (compared + 1, fastest.max(haste[c]));
+                (compared, fastest) = (compared + 1, fastest.max(lr_scale[c]));
             }
         }
         assert!(compared > 1000 && fastest > 4.0, "{compared} compared, fastest {fastest}");
@@ -507,7 +507,13 @@ fn training_finds_the_numbers_that_the_prior_does_not_know_and_leaves_the_others
     let composition = Composition::GaussiansSrgb;
     let wet = sunk(
         &gpu,
-        WaterView { water: WATER, refinement: None, by_direction: None, composition, show: Show::Seen },
+        WaterView {
+            water: WATER,
+            refinement: None,
+            by_direction: None,
+            composition,
+            output: Output::Underwater,
+        },
     );
     let mut run = watery(&wet, config(400), WaterConfig { lr: 0.03, ..with(WAYS[0]) });
     let medium = run.medium.as_mut().unwrap();

@@ -3,7 +3,7 @@
 use std::sync::atomic::{AtomicU32, Ordering};
 
 use fathom_core::gaussians::Gaussians;
-use fathom_core::gpu::{Recorder, StageTime};
+use fathom_core::gpu::{KernelTime, Recorder};
 use fathom_twins::samples;
 
 use crate::device::device;
@@ -54,7 +54,7 @@ fn a_recording_that_is_stepped_through_has_the_stages_and_the_bytes_of_one_submi
     let scene = Scene::new("random", samples::random(5, 300, 2), 75, 53);
     let view = View::render(&gpu, &scene);
     let image = view.image();
-    let run = |mut recorder: Recorder<'_>| -> Vec<StageTime> {
+    let run = |mut recorder: Recorder<'_>| -> Vec<KernelTime> {
         gpu.write(&view.frame.targets().unwrap().image, 0, &vec![[7.0_f32; 4]; view.pixels()]);
         view.frame.record_forward(&gpu, &mut recorder, &view.blocks, &view.uniform).unwrap();
         let times = recorder.submit_timed().unwrap();
@@ -62,13 +62,13 @@ fn a_recording_that_is_stepped_through_has_the_stages_and_the_bytes_of_one_submi
         times
     };
     let stepped = run(Recorder::stepped(&gpu, ticking));
-    assert!(stepped.iter().any(|time| time.stage == "sort_scatter" && time.dispatches > 1), "{stepped:?}");
+    assert!(stepped.iter().any(|time| time.kernel == "sort_scatter" && time.dispatches > 1), "{stepped:?}");
     for time in &stepped {
-        assert_eq!(time.seconds, f64::from(time.dispatches), "{}: a tick a dispatch", time.stage);
+        assert_eq!(time.seconds, f64::from(time.dispatches), "{}: a tick a dispatch", time.kernel);
     }
     if gpu.has_timestamps() {
         let names =
-            |times: &[StageTime]| -> Vec<_> { times.iter().map(|t| (t.stage, t.dispatches)).collect() };
+            |times: &[KernelTime]| -> Vec<_> { times.iter().map(|t| (t.kernel, t.dispatches)).collect() };
         assert_eq!(names(&stepped), names(&run(Recorder::timed(&gpu))));
     }
 }

@@ -33,16 +33,16 @@ pub struct LearningRates {
 }
 
 impl LearningRates {
-    /// The rates of a view at a [`haste`]. Those of scales and of the higher bands stay as they are: short
-    /// runs want them so large that one visit may not do more. The fewer views see a Gaussian, the more they
-    /// would take its colour apart by direction (bench/history.jsonl).
-    pub fn hastened(&self, haste: f64) -> Self {
+    /// The rates of a view, scaled by [`lr_scale`]. Those of scales and of the higher bands stay as they are:
+    /// short runs want them so large that one visit may not do more. The fewer views see a Gaussian, the more
+    /// they would take its colour apart by direction (bench/history.jsonl).
+    pub fn scaled(&self, lr_scale: f64) -> Self {
         Self {
-            means: haste * self.means,
-            quats: haste * self.quats,
+            means: lr_scale * self.means,
+            quats: lr_scale * self.quats,
             log_scales: self.log_scales,
-            opacity_logits: haste * self.opacity_logits,
-            sh_dc: haste * self.sh_dc,
+            opacity_logits: lr_scale * self.opacity_logits,
+            sh_dc: lr_scale * self.sh_dc,
             sh_rest: self.sh_rest,
         }
     }
@@ -80,15 +80,15 @@ impl AdamState {
 }
 
 /// Largest factor on the rates of a view that sees little of the model.
-pub const MOST_HASTE: f64 = 8.0;
+pub const MAX_LR_SCALE: f64 = 8.0;
 
 /// The factor on the rates of a view that sees `seen` of `trainable` Gaussians: 1 / sqrt(p), p the share that
 /// it sees.
 ///
 /// Where Adam acts on all Gaussians in every iteration, the second moment of one that a share p of the views
 /// sees averages zeros too, so its steps are that much larger for each view that sees it.
-pub fn haste(trainable: usize, seen: usize) -> f64 {
-    (trainable as f64 / seen.max(1) as f64).sqrt().min(MOST_HASTE)
+pub fn lr_scale(trainable: usize, seen: usize) -> f64 {
+    (trainable as f64 / seen.max(1) as f64).sqrt().min(MAX_LR_SCALE)
 }
 
 /// One update of the Gaussians for which `visible` holds; the others stay as they are.

@@ -34,8 +34,8 @@ mod spherical_harmonics;
 mod water;
 
 pub use adam::{
-    AdamState, BETA_1, BETA_2, EPSILON, LearningRates, MOST_HASTE, adam, adam_compact, adam_update,
-    adam_update_with, haste,
+    AdamState, BETA_1, BETA_2, EPSILON, LearningRates, MAX_LR_SCALE, adam, adam_compact, adam_update,
+    adam_update_with, lr_scale,
 };
 pub use chain::{ViewGradients, ViewInput, render, view_gradients};
 pub use dbdr::{RefinementState, form_refined, form_refined_backward};
@@ -54,8 +54,8 @@ pub use rasterize_backward::{RasterGradients, SplatGradient, rasterize_backward}
 pub use rasterize_forward::{Raster, rasterize_forward};
 pub use spherical_harmonics::{sh_basis_gradient, sh_colour, sh_colour_backward};
 pub use water::{
-    Blended, MOST_COLOUR_HASTE, WaterState, decode, encode, form, form_backward, haste_under_water, in_water,
-    in_water_backward,
+    Blended, MAX_COLOUR_LR_SCALE, WaterState, decode, encode, form, form_backward, in_water,
+    in_water_backward, lr_scale_under_water,
 };
 
 /// Gaussians nearer than this along z are not drawn, scene units.

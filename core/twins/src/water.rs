@@ -9,7 +9,7 @@ use fathom_core::config::{Blend, Medium};
 use fathom_core::water::{LEAST_ALPHA, Water};
 
 /// Largest factor on the rate of a colour under water.
-pub const MOST_COLOUR_HASTE: f64 = 8.0;
+pub const MAX_COLOUR_LR_SCALE: f64 = 8.0;
 
 /// Linear light of an sRGB value not below 0 (IEC 61966-2-1), and its derivative.
 pub fn decode(s: f64) -> (f64, f64) {
@@ -41,13 +41,13 @@ pub fn in_water(water: &Water, rgb: [f64; 3], range: f64) -> [f64; 3] {
 }
 
 /// What the rate of channel `c` of the constant colour is multiplied by under water: 1 over the slope of what
-/// is seen, in sRGB too, between 1 and [`MOST_COLOUR_HASTE`]. Higher bands keep their rate
+/// is seen, in sRGB too, between 1 and [`MAX_COLOUR_LR_SCALE`]. Higher bands keep their rate
 /// (bench/history.jsonl).
-pub fn haste_under_water(water: &Water, rgb: [f64; 3], range: f64) -> [f64; 3] {
+pub fn lr_scale_under_water(water: &Water, rgb: [f64; 3], range: f64) -> [f64; 3] {
     let seen = in_water(water, rgb, range);
     std::array::from_fn(|c| {
         let slope = (-water.beta_d[c] * range).exp() * decode(rgb[c]).1 * encode(seen[c]).1;
-        1.0 / slope.clamp(1.0 / MOST_COLOUR_HASTE, 1.0)
+        1.0 / slope.clamp(1.0 / MAX_COLOUR_LR_SCALE, 1.0)
     })
 }
 

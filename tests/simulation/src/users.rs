@@ -9,7 +9,7 @@ use std::time::Duration;
 use fathom_coordinator::schedule::JobId;
 use fathom_proto::admin::v1 as admin_v1;
 use fathom_proto::admin::v1::admin_service_client::AdminServiceClient;
-use fathom_proto::dial::{Line, reason};
+use fathom_proto::dial::{Connection, reason};
 use fathom_proto::v1;
 use fathom_proto::v1::job_event::Event;
 use fathom_proto::v1::job_service_client::JobServiceClient;
@@ -35,8 +35,8 @@ const SILENCE: Duration = Duration::from_secs(20);
 pub struct User {
     world: Arc<World>,
     index: usize,
-    jobs: JobServiceClient<Line>,
-    uploads: UploadServiceClient<Line>,
+    jobs: JobServiceClient<Connection>,
+    uploads: UploadServiceClient<Connection>,
     blobs: BlobClient,
 }
 
@@ -74,7 +74,7 @@ impl User {
     }
 
     /// Retries a call until it is answered; refusals are answers.
-    async fn ask<T, F>(&self, mut call: impl FnMut(JobServiceClient<Line>) -> F) -> Result<T, Status>
+    async fn ask<T, F>(&self, mut call: impl FnMut(JobServiceClient<Connection>) -> F) -> Result<T, Status>
     where
         F: Future<Output = Result<tonic::Response<T>, Status>>,
     {

@@ -7,7 +7,7 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 use fathom_core::cover::{CoverMeter, HeldOut};
-use fathom_core::gpu::{Gpu, Rendered, Renderer, SeamRun, Show, WaterView};
+use fathom_core::gpu::{Gpu, Output, Rendered, Renderer, SeamRun, WaterView};
 use fathom_core::metrics::{SsimMap, psnr, quantised};
 use fathom_core::picture::{encode_png, prepared_camera};
 use fathom_core::ply;
@@ -47,7 +47,7 @@ pub fn run(
     let model = ply::read_model(path)?;
     let gaussians = model.len() as u32;
     let record = ply::water_record(path)?;
-    let through = |show| record.as_ref().map(|record| WaterView::of_record(record, show));
+    let through = |output| record.as_ref().map(|record| WaterView::of_record(record, output));
     let mip_filter = ply::is_antialiased(path)?;
     let mut renderer = Renderer::new(Arc::clone(gpu), &model)?.with_mip_filter(mip_filter);
     let mut seams = match &spec.seams {
@@ -58,7 +58,7 @@ pub fn run(
         None => None,
     };
     let gains = match &record {
-        Some(record) => Some(gains_of(&mut renderer, WaterView::of_record(record, Show::Clear), views)?),
+        Some(record) => Some(gains_of(&mut renderer, WaterView::of_record(record, Output::Restored), views)?),
         None => None,
     };
     let (points, cameras) = (read_points(task)?, all_cameras(task)?);
@@ -70,19 +70,19 @@ pub fn run(
             return Err(TaskError::Stopped { checkpoint: None });
         }
         let truth = views.load(index)?;
-        let mut shown = |show| -> Result<Rendered, TaskError> {
-            renderer.set_water(through(show));
+        let mut shown = |output| -> Result<Rendered, TaskError> {
+            renderer.set_water(through(output));
             Ok(renderer.render(&view.camera, &view.pose, BACKGROUND)?)
         };
         let picture = |shown: &Rendered| quantised(shown.width, shown.height, &shown.rgb);
-        let seen = shown(Show::Seen)?;
+        let seen = shown(Output::Underwater)?;
         let render = picture(&seen);
         let (mut parts, mut clear) = (Vec::new(), None);
         if let Some(gains) = gains {
-            let mut rendered = shown(Show::Clear)?;
+            let mut rendered = shown(Output::Restored)?;
             clear = Some(picture(&rendered));
             white_point::apply(&mut rendered.rgb, gains);
-            parts = vec![picture(&rendered), picture(&shown(Show::Veil)?)];
+            parts = vec![picture(&rendered), picture(&shown(Output::Backscatter)?)];
         }
         cover.add(&HeldOut {
             index: task.common.views[index],

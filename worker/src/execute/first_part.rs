@@ -65,7 +65,7 @@ pub fn run(
 
 /// Whether first tasks train the water; jobs with first tasks have more than one partition.
 fn refines_water(task: &TaskInput) -> bool {
-    task.config.water.is_refined(2)
+    task.config.water.is_joint_for(2)
 }
 
 /// The water as trained by this partition, and the evidence for each of its parameters.

@@ -20,7 +20,7 @@ const CHUNK: u32 = 1024;
 /// Decay of the moments: those of the Gaussians' Adam (`shaders/shared/adam.wgsl`).
 const BETAS: [f64; 2] = [0.8, 0.99];
 /// Largest factor on the rate of one of many views (`project_backward.wgsl`).
-const MOST_HASTE: f32 = 8.0;
+const MAX_LR_SCALE: f32 = 8.0;
 const IDENTITY: [[f32; 4]; 3] = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]];
 
 /// One iteration's step of an exposure.
@@ -85,7 +85,7 @@ impl Exposures {
             view: now.view,
             // Every view is seen once an epoch; where views have weights, in the mean.
             steps: now.number / now.views + 1,
-            rate: Self::haste(now.views as usize) * interpolate_log(start, end, now.progress()),
+            rate: Self::lr_scale(now.views as usize) * interpolate_log(start, end, now.progress()),
             size: now.photograph.size,
         }
     }
@@ -94,10 +94,10 @@ impl Exposures {
     /// the share.
     ///
     /// Where Adam acts on all views in every iteration (3DGS), the second moment of one of them averages the
-    /// zeros of the others too; the same as for Gaussians (`haste` in `project_backward.wgsl`), at most by
+    /// zeros of the others too; the same as for Gaussians (`lr_scale` in `project_backward.wgsl`), at most by
     /// the same factor.
-    pub fn haste(views: usize) -> f32 {
-        (views as f32).sqrt().min(MOST_HASTE)
+    pub fn lr_scale(views: usize) -> f32 {
+        (views as f32).sqrt().min(MAX_LR_SCALE)
     }
 
     /// Makes room for pictures of `size`.
@@ -127,7 +127,7 @@ impl Exposures {
     /// alpha.
     ///
     /// # Errors
-    /// When the stage does not compile or no room was made.
+    /// When the kernel does not compile or no room was made.
     pub fn record(
         &self,
         gpu: &Gpu,
@@ -166,7 +166,7 @@ impl Exposures {
     /// by `image` after.
     ///
     /// # Errors
-    /// When a stage does not compile or no room was made.
+    /// When a kernel does not compile or no room was made.
     pub fn record_backward(
         &self,
         recorder: &mut Recorder<'_>,

@@ -143,7 +143,7 @@ impl Film {
     /// alpha.
     ///
     /// # Errors
-    /// When a stage does not compile or no room was made.
+    /// When a kernel does not compile or no room was made.
     pub fn record(
         &self,
         gpu: &Gpu,
@@ -163,7 +163,7 @@ impl Film {
             rate,
             unbias1,
             unbias2,
-            view_rate: Exposures::haste(self.views as usize) * rate,
+            view_rate: Exposures::lr_scale(self.views as usize) * rate,
             view_unbias1,
             view_unbias2,
         };
@@ -195,7 +195,7 @@ impl Film {
     /// what [`Film::record`] gave before, by `image` after.
     ///
     /// # Errors
-    /// When a stage does not compile or no room was made.
+    /// When a kernel does not compile or no room was made.
     pub fn record_backward(
         &self,
         recorder: &mut Recorder<'_>,

@@ -17,7 +17,7 @@ use std::mem::offset_of;
 use super::adam::unbiasing;
 use crate::config::{Composition, LossLight};
 use crate::gpu::{
-    Frame, Gpu, MediumUniform, Recorder, Show, Size, WaterState, WaterUniform, medium, water_rows,
+    Frame, Gpu, MediumUniform, Output, Recorder, Size, WaterState, WaterUniform, medium, water_rows,
 };
 use crate::water::{RangeModulation, StandardErrors, Water, WaterRecord};
 use crate::{CoreError, Result};
@@ -139,7 +139,7 @@ impl DeviceMedium {
 
     /// `Frame.medium` of a training view.
     pub fn frame_medium(&self) -> u32 {
-        medium::of(self.run.composition, Show::Seen)
+        medium::of(self.run.composition, Output::Underwater)
     }
 
     /// Gives the numbers at the start of the run to `frame`.
@@ -240,11 +240,11 @@ impl DeviceMedium {
         gpu.write(&self.state, MOMENTS_AT, &[[0.0_f32; 9]; 2]);
         let water = Water::from_raw(raw.map(f64::from), self.run.unit);
         gpu.write(&self.state, SHARES_AT, &self.run.shares_of_rate(&water, Some(standard_error)));
-        self.tell_standard_error(standard_error);
+        self.set_standard_error(standard_error);
     }
 
     /// Tells these standard errors of the nine numbers from now on.
-    pub fn tell_standard_error(&mut self, standard_error: [f64; 9]) {
+    pub fn set_standard_error(&mut self, standard_error: [f64; 9]) {
         self.run.standard_error = Some(standard_error);
     }
 
@@ -310,7 +310,7 @@ impl DeviceMedium {
     /// of the loss, alpha.
     ///
     /// # Errors
-    /// When the stage does not compile or no room was made.
+    /// When the kernel does not compile or no room was made.
     pub fn record(
         &self,
         gpu: &Gpu,
@@ -382,7 +382,7 @@ impl DeviceMedium {
     /// `record`.
     ///
     /// # Errors
-    /// When a stage does not compile or no room was made.
+    /// When a kernel does not compile or no room was made.
     pub fn record_backward(
         &self,
         gpu: &Gpu,
@@ -438,7 +438,7 @@ impl DeviceMedium {
     /// list was too short.
     ///
     /// # Errors
-    /// When the stage does not compile or no room was made.
+    /// When the kernel does not compile or no room was made.
     pub fn record_step(&self, recorder: &mut Recorder<'_>, frame: &Frame) -> Result<()> {
         let sized = self.sized()?;
         recorder.dispatch(

@@ -104,7 +104,7 @@ impl DevicePriors {
     /// Records what goes to the picture under water, between the loss and the way back through the water.
     ///
     /// # Errors
-    /// When a stage does not compile or no room was made.
+    /// When a kernel does not compile or no room was made.
     pub fn record(
         &self,
         gpu: &Gpu,
@@ -162,7 +162,7 @@ impl DevicePriors {
     /// the water.
     ///
     /// # Errors
-    /// When a stage does not compile or no room was made.
+    /// When a kernel does not compile or no room was made.
     pub fn record_after(
         &self,
         recorder: &mut Recorder<'_>,

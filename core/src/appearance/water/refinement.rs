@@ -37,7 +37,7 @@ impl RefinementStep {
     /// short.
     ///
     /// # Errors
-    /// When the stage does not compile.
+    /// When the kernel does not compile.
     pub fn record(&self, recorder: &mut Recorder<'_>, frame: &Frame, partials: &wgpu::Buffer) -> Result<()> {
         recorder.dispatch(
             "dbdr_step",

@@ -203,7 +203,7 @@ impl MediumRun {
     /// cameras do, at rates that suffice, and leave the constant colour its mean. In murky water they would
     /// only take up noise. A scene that is looked at from one side has light of that kind too: on
     /// seathru-japan 0.2 dB and 0.0024 of SSIM.
-    pub(crate) fn harmonics_haste(&self) -> f32 {
+    pub(crate) fn harmonics_lr_scale(&self) -> f32 {
         if self.is_clear() || self.shows_open_water == Some(true) { self.config.clear_harmonics } else { 1.0 }
     }
 
@@ -344,16 +344,17 @@ mod tests {
         let water = Water { beta_d: [0.9, 0.01, 0.02], ..Water::COASTAL };
         let run = MediumRun { water, ..MediumRun::fixed(&config, over_black, 7.0) };
         let weights = [run.background_weight(), run.surface_weight(), run.saturation_weight()];
-        assert_eq!((weights, run.harmonics_haste()), ([0.0; 3], config.clear_harmonics));
+        assert_eq!((weights, run.harmonics_lr_scale()), ([0.0; 3], config.clear_harmonics));
         assert_eq!(run.over_what_is_behind().composition, over_black);
     }
 
     #[test]
-    fn harmonics_are_hastened_in_clear_water_alone() {
+    fn clear_water_alone_raises_the_rate_of_harmonics() {
         let of = |clearest: f64| {
             let water = Water { beta_d: [0.9, clearest, 2.0 * clearest], ..Water::COASTAL };
             let config = WaterConfig { clear_harmonics: 3.0, ..WaterConfig::default() };
-            MediumRun { water, ..MediumRun::fixed(&config, Composition::PixelsSrgb, 7.0) }.harmonics_haste()
+            MediumRun { water, ..MediumRun::fixed(&config, Composition::PixelsSrgb, 7.0) }
+                .harmonics_lr_scale()
         };
         assert_eq!([of(1e-3), of(0.0), of(0.08)], [3.0, 3.0, 1.0]);
     }

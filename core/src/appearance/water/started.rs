@@ -87,7 +87,7 @@ impl StartedWater {
 
     pub(in crate::appearance) fn weigh(&self, step: &mut StepUniform, view: &TrainView) {
         let run = self.medium.run();
-        step.sh_rest_lr *= run.harmonics_haste();
+        step.sh_rest_lr *= run.harmonics_lr_scale();
         step.overwhite_weight = run.saturation_weight();
         step.floater_weight = run.config.floater_weight;
         step.clear_range = view.clear_range;

@@ -20,7 +20,7 @@ impl DeviceMedium {
     /// Records what goes from the gradients of all splats to the water parameters, before the Gaussians move.
     ///
     /// # Errors
-    /// When a stage does not compile or no room was made.
+    /// When a kernel does not compile or no room was made.
     pub fn record_gradients(
         &self,
         gpu: &Gpu,

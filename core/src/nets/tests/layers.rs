@@ -9,12 +9,12 @@ use crate::nets::layers::{
 use crate::nets::parameters::{Layout, Parameters, Place};
 
 /// Layers in f64 with random weights.
-struct Bench {
+struct Fixture {
     weights: Vec<f64>,
     places: Vec<Place>,
 }
 
-impl Bench {
+impl Fixture {
     fn new(layout: Layout) -> Self {
         let places = layout.places();
         let count = Parameters::new(layout, 0).values().len();
@@ -50,7 +50,7 @@ fn group_norm_is_that_of_plain_loops() {
     let size @ [channels, height, width] = [8, 4, 5];
     let mut layout = Layout::default();
     let norm = GroupNorm::new(&mut layout, channels);
-    let bench = Bench::new(layout);
+    let fixture = Fixture::new(layout);
     let x = random(22, channels * height * width);
     let pixels = height * width;
     let in_group = channels / GROUPS * pixels;
@@ -61,10 +61,10 @@ fn group_norm_is_that_of_plain_loops() {
         for (i, value) in values.iter_mut().enumerate() {
             let channel = group * (channels / GROUPS) + i / pixels;
             let normal = (*value - mean) / (variance + VARIANCE_FLOOR).sqrt();
-            *value = normal * bench.array(norm.scale)[channel] + bench.array(norm.shift)[channel];
+            *value = normal * fixture.array(norm.scale)[channel] + fixture.array(norm.shift)[channel];
         }
     }
-    assert_same("norm", &norm.forward(&bench.weights, picture(&x, size)).0.values, &expected);
+    assert_same("norm", &norm.forward(&fixture.weights, picture(&x, size)).0.values, &expected);
 }
 
 #[test]
@@ -72,8 +72,8 @@ fn squeeze_and_excitation_is_that_of_plain_loops() {
     let size @ [channels, height, width] = [8, 4, 6];
     let mut layout = Layout::default();
     let block = SqueezeExcite::new(&mut layout, channels);
-    let bench = Bench::new(layout);
-    let arrays: Vec<&[f64]> = bench.places.iter().map(|place| bench.array(*place)).collect();
+    let fixture = Fixture::new(layout);
+    let arrays: Vec<&[f64]> = fixture.places.iter().map(|place| fixture.array(*place)).collect();
     let [squeeze, squeeze_bias, excite, excite_bias] = arrays.as_slice() else { panic!("four arrays") };
     let x = random(23, channels * height * width);
     let pixels = height * width;
@@ -92,7 +92,7 @@ fn squeeze_and_excitation_is_that_of_plain_loops() {
     };
     assert!(hidden.iter().any(|h| *h > 0.0) && hidden.contains(&0.0), "both sides of the ReLU");
     let expected: Vec<f64> = x.iter().enumerate().map(|(i, x)| x * gain(i / pixels)).collect();
-    assert_same("squeeze", &block.forward(&bench.weights, picture(&x, size)).0.values, &expected);
+    assert_same("squeeze", &block.forward(&fixture.weights, picture(&x, size)).0.values, &expected);
 }
 
 #[test]
@@ -100,16 +100,16 @@ fn the_attention_gate_is_that_of_plain_loops() {
     let size @ [channels, height, width] = [8, 4, 6];
     let mut layout = Layout::default();
     let gate = AttentionGate::new(&mut layout, channels);
-    let bench = Bench::new(layout);
+    let fixture = Fixture::new(layout);
     let pixels = height * width;
     let (gating, skip) = (random(24, channels * pixels), random(25, channels * pixels));
     let pointwise = |conv: &Conv, x: &[f64], pixel: usize| -> Vec<f64> {
         let (to, from) = (conv.to, conv.from);
-        let weight = bench.array(conv.weight);
+        let weight = fixture.array(conv.weight);
         (0..to)
             .map(|o| {
                 let sum: f64 = (0..from).map(|i| weight[o * from + i] * x[i * pixels + pixel]).sum();
-                sum + bench.array(conv.bias)[o]
+                sum + fixture.array(conv.bias)[o]
             })
             .collect()
     };
@@ -120,12 +120,12 @@ fn the_attention_gate_is_that_of_plain_loops() {
                 .zip(pointwise(&gate.skip, &skip, pixel))
                 .map(|(a, b)| (a + b).max(0.0))
                 .collect();
-            let psi: f64 = joint.iter().zip(bench.array(gate.psi.weight)).map(|(j, w)| j * w).sum();
-            sigmoid(psi + bench.array(gate.psi.bias)[0])
+            let psi: f64 = joint.iter().zip(fixture.array(gate.psi.weight)).map(|(j, w)| j * w).sum();
+            sigmoid(psi + fixture.array(gate.psi.bias)[0])
         })
         .collect();
     let expected: Vec<f64> = skip.iter().enumerate().map(|(i, x)| x * gains[i % pixels]).collect();
-    let (found, _) = gate.forward(&bench.weights, &picture(&gating, size), &picture(&skip, size));
+    let (found, _) = gate.forward(&fixture.weights, &picture(&gating, size), &picture(&skip, size));
     assert_same("gate", &found.values, &expected);
 }
 
@@ -138,28 +138,28 @@ fn a_convolution_is_that_of_plain_loops_and_so_is_its_mean() {
         let mut layout = Layout::default();
         let mean = MeanConv::new(&mut layout, from, to);
         let conv = &mean.0;
-        let bench = Bench::new(layout);
+        let fixture = Fixture::new(layout);
         let x = random(26, from * height * width);
         let mut expected = Vec::new();
         for o in 0..to {
             for (y, column) in (0..height).flat_map(|y| (0..width).map(move |column| (y, column))) {
-                let mut sum = bench.array(conv.bias)[o];
+                let mut sum = fixture.array(conv.bias)[o];
                 for (i, ky, kx) in (0..from * 9).map(|tap| (tap / 9, tap / 3 % 3, tap % 3)) {
                     let (row, at) = ((y + ky).wrapping_sub(1), (column + kx).wrapping_sub(1));
                     if row < height && at < width {
-                        let weight = bench.array(conv.weight)[((o * 3 + ky) * 3 + kx) * from + i];
+                        let weight = fixture.array(conv.weight)[((o * 3 + ky) * 3 + kx) * from + i];
                         sum += weight * x[(i * height + row) * width + at];
                     }
                 }
                 expected.push(sum);
             }
         }
-        assert_same("conv", &conv.forward(&bench.weights, &picture(&x, size)).values, &expected);
+        assert_same("conv", &conv.forward(&fixture.weights, &picture(&x, size)).values, &expected);
         let means: Vec<f64> = expected
             .chunks(height * width)
             .map(|channel| channel.iter().sum::<f64>() / (height * width) as f64)
             .collect();
-        assert_same("mean", &mean.forward(&bench.weights, &picture(&x, size)).0, &means);
+        assert_same("mean", &mean.forward(&fixture.weights, &picture(&x, size)).0, &means);
     }
 }
 
@@ -168,7 +168,7 @@ fn the_transposed_convolution_is_that_of_plain_loops() {
     let (size @ [from, height, width], to) = ([6, 4, 5], 3);
     let mut layout = Layout::default();
     let up = UpConv::new(&mut layout, from, to);
-    let bench = Bench::new(layout);
+    let fixture = Fixture::new(layout);
     let x = random(29, from * height * width);
     let mut expected = Vec::new();
     for (o, y, column) in (0..to * 4 * height * width)
@@ -176,13 +176,13 @@ fn the_transposed_convolution_is_that_of_plain_loops() {
     {
         let sum: f64 = (0..from)
             .map(|i| {
-                let weight = bench.array(up.weight)[((o * 2 + y % 2) * 2 + column % 2) * from + i];
+                let weight = fixture.array(up.weight)[((o * 2 + y % 2) * 2 + column % 2) * from + i];
                 weight * x[(i * height + y / 2) * width + column / 2]
             })
             .sum();
-        expected.push(sum + bench.array(up.bias)[o]);
+        expected.push(sum + fixture.array(up.bias)[o]);
     }
-    assert_same("up", &up.forward(&bench.weights, &picture(&x, size)).values, &expected);
+    assert_same("up", &up.forward(&fixture.weights, &picture(&x, size)).values, &expected);
 }
 
 /// Compares what `backward(weights, x, v_y, v_weights)` gives with central differences of
@@ -235,11 +235,11 @@ fn gradients_of_convolutions_match_central_differences() {
     ] {
         let mut layout = Layout::default();
         let conv = Conv::new(&mut layout, from, to, kernel);
-        let bench = Bench::new(layout);
+        let fixture = Fixture::new(layout);
         let y_size = [to, size[1], size[2]];
         check_gradients(
             &format!("{kernel}x{kernel} from {size:?} to {to}"),
-            &bench.weights,
+            &fixture.weights,
             &random(32, size.iter().product()),
             |w, x| conv.forward(w, &picture(x, size)).values,
             |w, x, v_y, v_w| conv.backward(w, &picture(x, size), &picture(v_y, y_size), v_w).values,
@@ -248,7 +248,7 @@ fn gradients_of_convolutions_match_central_differences() {
             let mean = MeanConv(conv);
             check_gradients(
                 &format!("mean from {size:?} to {to}"),
-                &bench.weights,
+                &fixture.weights,
                 &random(33, size.iter().product()),
                 |w, x| mean.forward(w, &picture(x, size)).0,
                 |w, x, v_y, v_w| mean.backward(w, &mean.forward(w, &picture(x, size)).1, v_y, v_w).values,
@@ -260,7 +260,7 @@ fn gradients_of_convolutions_match_central_differences() {
     let up = UpConv::new(&mut layout, size[0], to);
     check_gradients(
         "transposed",
-        &Bench::new(layout).weights,
+        &Fixture::new(layout).weights,
         &random(34, 60),
         |w, x| up.forward(w, &picture(x, size)).values,
         |w, x, v_y, v_w| up.backward(w, &picture(x, size), &picture(v_y, [to, 6, 8]), v_w).values,
@@ -276,7 +276,7 @@ fn gradients_of_the_other_layers_match_central_differences() {
     let norm = GroupNorm::new(&mut layout, 8);
     check_gradients(
         "norm",
-        &Bench::new(layout).weights,
+        &Fixture::new(layout).weights,
         &x,
         |w, x| norm.forward(w, picture(x, size)).0.values,
         |w, x, v_y, v_w| {
@@ -287,7 +287,7 @@ fn gradients_of_the_other_layers_match_central_differences() {
     let squeeze = SqueezeExcite::new(&mut layout, 8);
     check_gradients(
         "squeeze and excitation",
-        &Bench::new(layout).weights,
+        &Fixture::new(layout).weights,
         &x,
         |w, x| squeeze.forward(w, picture(x, size)).0.values,
         |w, x, v_y, v_w| {
@@ -298,7 +298,7 @@ fn gradients_of_the_other_layers_match_central_differences() {
     let residual = SeResidual::new(&mut layout, 8);
     check_gradients(
         "residual",
-        &Bench::new(layout).weights,
+        &Fixture::new(layout).weights,
         &x,
         |w, x| residual.forward(w, picture(x, size)).0.values,
         |w, x, v_y, v_w| {
@@ -311,7 +311,7 @@ fn gradients_of_the_other_layers_match_central_differences() {
     let halves = |x: &[f64]| (picture(&x[..96], size), picture(&x[96..], size));
     check_gradients(
         "gate",
-        &Bench::new(layout).weights,
+        &Fixture::new(layout).weights,
         &random(36, 192),
         |w, x| {
             let (gating, skip) = halves(x);
@@ -328,7 +328,7 @@ fn gradients_of_the_other_layers_match_central_differences() {
     let linear = Linear::pointwise(&mut layout, 7, 5);
     check_gradients(
         "linear",
-        &Bench::new(layout).weights,
+        &Fixture::new(layout).weights,
         &random(37, 7),
         |w, x| linear.forward(w, x),
         |w, x, v_y, v_w| linear.backward(w, x, v_y, v_w),

@@ -34,7 +34,7 @@ struct Decision {
 }
 
 impl Trainer {
-    pub(super) fn refine_classic(&mut self, stats: &[Stats]) -> Result<()> {
+    pub(super) fn densify_classic(&mut self, stats: &[Stats]) -> Result<()> {
         let limits = Limits::new(&self.config.classic, self.extent, self.schedule.was_reset(self.iteration));
         let decision = decide(stats, &limits, self.config.max_gaussians as usize);
         // Children and moves need the entries of before and of after.

@@ -22,7 +22,7 @@ pub(super) fn is_faded(opacity: f32) -> bool {
 
 impl Trainer {
     /// Relocates and adds Gaussians by the schedule.
-    pub(super) fn refine_mcmc(&mut self, stats: &[Stats]) -> Result<()> {
+    pub(super) fn densify_mcmc(&mut self, stats: &[Stats]) -> Result<()> {
         let target = self.schedule.target_count(self.iteration, self.initial) as usize;
         let moves = decide(stats, target, self.config.seed, self.iteration);
         if moves.is_empty() {

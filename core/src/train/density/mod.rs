@@ -18,7 +18,7 @@ use crate::{CoreError, Result};
 /// Most Gaussians that are split or moved between two submissions: bounds the staging buffer.
 const CHUNK: usize = 65_536;
 
-/// What is known of a trainable Gaussian, by `refine_stats.wgsl`.
+/// What is known of a trainable Gaussian, by `density_stats.wgsl`.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
 struct Stats {
@@ -45,16 +45,16 @@ fn fade_oversized(stats: &mut [Stats], largest: f32) {
 
 impl Trainer {
     /// Does what is due at this iteration; the device is idle before and after.
-    pub(super) fn refine(&mut self) -> Result<()> {
-        if self.schedule.refines_at(self.iteration) {
+    pub(super) fn densify(&mut self) -> Result<()> {
+        if self.schedule.densifies_at(self.iteration) {
             let mut stats = self.read_stats()?;
             if let Some(medium) = self.appearances.water() {
                 fade_oversized(&mut stats, medium.run().largest_deviation());
             }
             self.cover_surfaces(&mut stats)?;
             match self.config.strategy {
-                Strategy::Mcmc => self.refine_mcmc(&stats)?,
-                Strategy::Classic => self.refine_classic(&stats)?,
+                Strategy::Mcmc => self.densify_mcmc(&stats)?,
+                Strategy::Classic => self.densify_classic(&stats)?,
             }
             self.update_smoothing()?;
         }
@@ -72,15 +72,15 @@ impl Trainer {
                 continue;
             }
             let buffer =
-                self.gpu.buffer("refine stats", u64::from(block.count) * size_of::<Stats>() as u64)?;
+                self.gpu.buffer("density stats", u64::from(block.count) * size_of::<Stats>() as u64)?;
             let mut recorder = Recorder::new(&self.gpu);
             recorder.dispatch(
-                "refine_stats",
+                "density_stats",
                 Size::Items(block.count, 64),
                 &[
                     ("block", &block.uniform),
                     ("transforms", &block.transforms),
-                    ("refine", &training.refine),
+                    ("density_sums", &training.density_sums),
                     ("stats", &buffer),
                 ],
             )?;

@@ -62,7 +62,7 @@ impl Trainer {
         if let Some((depth, v_raw)) = predictor.used.take().zip(gathered) {
             predictor.learn(&depth, v_raw, false);
         }
-        let count = self.truth.views().len();
+        let count = self.targets.views().len();
         let asked = count.min(MOST_VIEWS);
         let mut said = Vec::with_capacity(asked);
         for view in (0..asked).map(|i| i * count / asked) {
@@ -117,7 +117,7 @@ impl Trainer {
 
     /// Camera and pose of a view at the size that the next iteration, or the last, has it.
     fn view_at_size(&self, index: usize) -> TrainViewAt {
-        let view = &self.truth.views()[index];
+        let view = &self.targets.views()[index];
         let progress = self.schedule.progress(self.iteration.min(self.config.iterations - 1));
         let level = self.schedule.level(progress, &view.camera);
         let [width, height] = [view.camera.width, view.camera.height].map(|side| (side >> level).max(1));

@@ -3,7 +3,7 @@
 
 use fathom_core::config::Composition;
 use fathom_core::gaussians::Gaussians;
-use fathom_core::gpu::{Renderer, Show, WaterView, device_for_test};
+use fathom_core::gpu::{Output, Renderer, WaterView, device_for_test};
 use fathom_core::metrics::{psnr, quantised};
 use fathom_core::ply;
 use fathom_core::views::{PackedImage, TrainView};
@@ -71,7 +71,7 @@ impl Photographer {
 
     fn seen(&self, model: &Gaussians) -> Vec<PackedImage> {
         let mut renderer = Renderer::new(Arc::clone(&self.gpu), model).unwrap();
-        renderer.set_water(Some(WaterView::of_record(&water(), Show::Seen)));
+        renderer.set_water(Some(WaterView::of_record(&water(), Output::Underwater)));
         let seen = |view: &TrainView| {
             let rendered = renderer.render(&view.camera, &view.pose, [0.0; 3]).unwrap();
             quantised(rendered.width, rendered.height, &rendered.rgb)

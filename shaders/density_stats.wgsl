@@ -8,7 +8,7 @@
 
 @group(0) @binding(0) var<uniform> block: Block;
 @group(0) @binding(1) var<storage, read> transforms: array<vec4<f32>>;
-@group(0) @binding(2) var<storage, read_write> refine: array<vec4<f32>>;
+@group(0) @binding(2) var<storage, read_write> density_sums: array<vec4<f32>>;
 @group(0) @binding(3) var<storage, read_write> stats: array<vec4<f32>>;
 
 @compute @workgroup_size(64)
@@ -22,8 +22,8 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let t1 = transforms[3u * i + 1u];
     let t2 = transforms[3u * i + 2u];
     let finite = is_finite(dot(t0.xyz, t0.xyz)) && is_finite(t0.w) && is_finite(dot(t1, t1)) && is_finite(dot(t2.xyz, t2.xyz));
-    let seen = refine[i];
-    refine[i] = vec4<f32>(0.0, 0.0, seen.z, 0.0);
+    let seen = density_sums[i];
+    density_sums[i] = vec4<f32>(0.0, 0.0, seen.z, 0.0);
     let means = vec2<f32>(seen.x, seen.w) / max(seen.y, 1.0);
     stats[i] = vec4<f32>(select(0.0, sigmoid(t0.w), finite), means, exp(max(t2.x, max(t2.y, t2.z))));
 }

@@ -21,7 +21,7 @@ const AHEAD: u32 = 8;
 pub(super) type Key = (usize, u32);
 
 /// The photographs of a run.
-pub(super) struct Truth {
+pub(super) struct TargetImages {
     views: Arc<dyn ViewSource>,
     seed: u32,
     /// Orders of the views in the epochs that were asked for last.
@@ -30,7 +30,7 @@ pub(super) struct Truth {
     ahead: Option<Ahead>,
 }
 
-impl Truth {
+impl TargetImages {
     /// Without threads every photograph is waited for.
     pub(super) fn new(views: Arc<dyn ViewSource>, seed: u32, threads: u32) -> Self {
         let ahead = Ahead::new(&views, threads);
@@ -69,7 +69,7 @@ impl Truth {
         view
     }
 
-    /// How many iterations ahead [`Truth::expect`] is worth calling.
+    /// How many iterations ahead [`TargetImages::expect`] is worth calling.
     pub(super) fn ahead(&self) -> u32 {
         if self.ahead.is_some() { AHEAD } else { 0 }
     }
@@ -166,11 +166,11 @@ impl Spare for Mutex<Resident> {
 
 /// Threads that read, decode and reduce photographs before they are asked for.
 struct Ahead {
-    shared: Arc<Shared>,
+    shared: Arc<SharedQueue>,
     threads: Vec<JoinHandle<()>>,
 }
 
-struct Shared {
+struct SharedQueue {
     queue: Mutex<Queue>,
     changed: Condvar,
 }
@@ -183,7 +183,7 @@ struct Queue {
     stopped: bool,
 }
 
-impl Shared {
+impl SharedQueue {
     fn lock(&self) -> MutexGuard<'_, Queue> {
         lock(&self.queue)
     }
@@ -196,7 +196,7 @@ impl Shared {
 impl Ahead {
     /// With as many threads as the system gives; `None` where there are none.
     fn new(views: &Arc<dyn ViewSource>, threads: u32) -> Option<Self> {
-        let shared = Arc::new(Shared { queue: Mutex::default(), changed: Condvar::new() });
+        let shared = Arc::new(SharedQueue { queue: Mutex::default(), changed: Condvar::new() });
         let mut ahead = Self { shared, threads: Vec::new() };
         for _ in 0..threads {
             let (shared, views) = (Arc::clone(&ahead.shared), Arc::clone(views));
@@ -250,9 +250,9 @@ impl Drop for Ahead {
     }
 }
 
-fn work(shared: &Shared, views: &dyn ViewSource) {
+fn work(shared: &SharedQueue, views: &dyn ViewSource) {
     /// Gives up what a thread has begun when it panics, so that nobody waits for it.
-    struct Begun<'a>(&'a Shared, Key);
+    struct Begun<'a>(&'a SharedQueue, Key);
     impl Drop for Begun<'_> {
         fn drop(&mut self) {
             let mut queue = self.0.lock();
@@ -363,9 +363,9 @@ mod tests {
         Arc::new(Many(vec![TrainView { name: String::new(), camera, pose, clear_range: 0.0 }; count]))
     }
 
-    fn weighted(weights: &[f32]) -> Truth {
+    fn weighted(weights: &[f32]) -> TargetImages {
         let views = Weighted::new(many(weights.len()), weights.to_vec()).unwrap();
-        Truth::new(Arc::new(views), 3, 0)
+        TargetImages::new(Arc::new(views), 3, 0)
     }
 
     #[test]
@@ -398,7 +398,7 @@ mod tests {
     fn equal_weights_change_nothing() {
         for weight in [1.0, 0.3, 7e-5] {
             let mut alike = weighted(&[weight; 11]);
-            let mut plain = Truth::new(many(11), 3, 0);
+            let mut plain = TargetImages::new(many(11), 3, 0);
             assert!((0..220).all(|at| alike.view_at(at) == plain.view_at(at)), "weight {weight}");
         }
     }
@@ -412,8 +412,8 @@ mod tests {
 
     #[test]
     fn every_view_comes_once_an_epoch() {
-        let mut truth = Truth::new(many(10), 3, 0);
-        let epoch = |truth: &mut Truth, first: u32| -> Vec<usize> {
+        let mut truth = TargetImages::new(many(10), 3, 0);
+        let epoch = |truth: &mut TargetImages, first: u32| -> Vec<usize> {
             (first..first + 10).map(|iteration| truth.view_at(iteration)).collect()
         };
         let orders: Vec<Vec<usize>> = [0, 10, 20, 0].map(|first| epoch(&mut truth, first)).into();

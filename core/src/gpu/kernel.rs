@@ -1,4 +1,4 @@
-//! Compute stages: WGSL with its imports, reflected bindings, and recording of dispatches.
+//! Compute kernels: WGSL with its imports, reflected bindings, and recording of dispatches.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, OnceLock};
@@ -9,7 +9,7 @@ use crate::{CoreError, Result};
 // `STAGES` and `SHARED`: name and text of each file of `shaders/` and of `shaders/shared/` (`core/build.rs`).
 include!(concat!(env!("OUT_DIR"), "/shaders.rs"));
 
-/// How stages are laid out on an adapter.
+/// How kernels are laid out on an adapter.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct TileLayout {
     /// Side of a tile, pixels: a multiple of 8.
@@ -39,11 +39,11 @@ impl TileLayout {
     }
 }
 
-/// Begins a line that names a stage and the files that imports stand for in it:
+/// Begins a line that names a kernel and the files that imports stand for in it:
 /// `//@ variant NAME light=water+light_linear`.
 const VARIANT: &str = "//@ variant ";
 
-/// A stage that is made from a file, with what some of its imports stand for.
+/// A kernel that is made from a file, with what some of its imports stand for.
 struct Variant {
     name: &'static str,
     /// Import, and the files that it stands for.
@@ -67,32 +67,32 @@ impl Variant {
     }
 }
 
-/// The file that a stage is made from, by name, and the variant where the file has some.
-fn file_of(stage: &str) -> (&str, Option<Variant>) {
+/// The file that a kernel is made from, by name, and the variant where the file has some.
+fn file_of(kernel: &str) -> (&str, Option<Variant>) {
     let variants =
         STAGES.iter().flat_map(|(file, text)| Variant::of(text).map(move |variant| (*file, variant)));
-    match variants.into_iter().find(|(_, variant)| variant.name == stage) {
+    match variants.into_iter().find(|(_, variant)| variant.name == kernel) {
         Some((file, variant)) => (file, Some(variant)),
-        None => (stage, None),
+        None => (kernel, None),
     }
 }
 
-/// Names of the files of `shaders/`, each a stage.
-pub fn stage_names() -> impl Iterator<Item = &'static str> {
+/// Names of the files of `shaders/`, each a kernel.
+pub fn kernel_names() -> impl Iterator<Item = &'static str> {
     STAGES.iter().map(|(name, _)| *name)
 }
 
-/// Names of the stages that are made from the file of another with other imports.
-pub fn stage_variants() -> impl Iterator<Item = &'static str> {
+/// Names of the kernels that are made from the file of another with other imports.
+pub fn kernel_variants() -> impl Iterator<Item = &'static str> {
     let variants = STAGES.iter().flat_map(|(_, text)| Variant::of(text)).map(|variant| variant.name);
     variants.filter(|name| STAGES.iter().all(|(file, _)| file != name))
 }
 
-/// The whole WGSL of a stage: the tile's size, what the stage's first line `//@ import a, b` names from
+/// The whole WGSL of a kernel: the tile's size, what the kernel's first line `//@ import a, b` names from
 /// `shaders/shared/`, then itself.
 ///
 /// # Errors
-/// When the stage or an import does not exist.
+/// When the kernel or an import does not exist.
 pub fn shader_source(name: &str, layout: TileLayout) -> Result<String> {
     let find = |list: &[(&str, &'static str)], name: &str| {
         list.iter()
@@ -125,8 +125,8 @@ pub fn shader_source(name: &str, layout: TileLayout) -> Result<String> {
     Ok(source)
 }
 
-/// A compiled stage.
-pub struct Stage {
+/// A compiled kernel.
+pub struct Kernel {
     name: &'static str,
     pipeline: wgpu::ComputePipeline,
     layout: wgpu::BindGroupLayout,
@@ -135,7 +135,7 @@ pub struct Stage {
     groups: Mutex<HashMap<Vec<wgpu::Buffer>, wgpu::BindGroup>>,
 }
 
-impl Stage {
+impl Kernel {
     fn compile(gpu: &Gpu, name: &'static str) -> Result<Self> {
         let source = shader_source(name, gpu.layout())?;
         let module = naga::front::wgsl::parse_str(&source)
@@ -152,7 +152,7 @@ impl Stage {
         let shader = if gpu.shader_checks() {
             gpu.device().create_shader_module(descriptor)
         } else {
-            // SAFETY: only the stages of `shaders/` come here. They index by counts that stages before them
+            // SAFETY: only the kernels of `shaders/` come here. They index by counts that kernels before them
             // made and clamped to the lengths of the lists, and every loop counts up to one; that checks
             // change no byte of what they write, also with rubbish in every buffer and lists that are too
             // short, is tested in `core/tests/kernels`.
@@ -182,7 +182,7 @@ impl Stage {
         let mut groups = self
             .groups
             .lock()
-            .map_err(|_| CoreError::Gpu(format!("stage {}: a thread panicked while binding", self.name)))?;
+            .map_err(|_| CoreError::Gpu(format!("kernel {}: a thread panicked while binding", self.name)))?;
         if let Some(group) = groups.get(&key) {
             return Ok(group.clone());
         }
@@ -191,7 +191,7 @@ impl Stage {
             let binding = *self
                 .bindings
                 .get(*name)
-                .ok_or_else(|| CoreError::Gpu(format!("stage {} has no binding {name}", self.name)))?;
+                .ok_or_else(|| CoreError::Gpu(format!("kernel {} has no binding {name}", self.name)))?;
             entries.push(wgpu::BindGroupEntry { binding, resource: buffer.as_entire_binding() });
         }
         let group = gpu.device().create_bind_group(&wgpu::BindGroupDescriptor {
@@ -205,14 +205,14 @@ impl Stage {
     }
 }
 
-/// All stages of a device, compiled on first use.
+/// All kernels of a device, compiled on first use.
 #[derive(Default)]
-pub(crate) struct Stages {
-    compiled: Mutex<HashMap<&'static str, Arc<OnceLock<Arc<Stage>>>>>,
+pub(crate) struct Kernels {
+    compiled: Mutex<HashMap<&'static str, Arc<OnceLock<Arc<Kernel>>>>>,
 }
 
-impl Stages {
-    fn get(&self, gpu: &Gpu, name: &'static str) -> Result<Arc<Stage>> {
+impl Kernels {
+    fn get(&self, gpu: &Gpu, name: &'static str) -> Result<Arc<Kernel>> {
         let cell = {
             let mut compiled = self
                 .compiled
@@ -220,19 +220,19 @@ impl Stages {
                 .map_err(|_| CoreError::Gpu("a thread panicked while compiling".into()))?;
             Arc::clone(compiled.entry(name).or_default())
         };
-        if let Some(stage) = cell.get() {
-            return Ok(Arc::clone(stage));
+        if let Some(kernel) = cell.get() {
+            return Ok(Arc::clone(kernel));
         }
-        let stage = Arc::new(Stage::compile(gpu, name)?);
-        Ok(Arc::clone(cell.get_or_init(|| stage)))
+        let kernel = Arc::new(Kernel::compile(gpu, name)?);
+        Ok(Arc::clone(cell.get_or_init(|| kernel)))
     }
 
     /// Drops all bind groups, so that buffers that were replaced can be freed: called before a buffer is
     /// made, and where memory is given back. Nobody who replaces a buffer needs to know of them.
     pub(super) fn forget_bind_groups(&self) {
         let Ok(compiled) = self.compiled.lock() else { return };
-        for stage in compiled.values().filter_map(|cell| cell.get()) {
-            if let Ok(mut groups) = stage.groups.lock() {
+        for kernel in compiled.values().filter_map(|cell| cell.get()) {
+            if let Ok(mut groups) = kernel.groups.lock() {
                 groups.clear();
             }
         }
@@ -246,29 +246,29 @@ pub enum Size<'a> {
     Groups(u32),
     /// One thread an item, this many threads a group.
     Items(u32, u32),
-    /// Made by a `count_*` stage: slot of the argument buffer.
+    /// Made by a `count_*` kernel: slot of the argument buffer.
     Indirect(&'a wgpu::Buffer, u32),
 }
 
-/// Device time of a stage, seconds.
+/// Device time of a kernel, seconds.
 #[derive(Clone, Debug, PartialEq)]
-pub struct StageTime {
-    /// The stage.
-    pub stage: &'static str,
+pub struct KernelTime {
+    /// The kernel.
+    pub kernel: &'static str,
     /// Seconds on the device, all its dispatches together.
     pub seconds: f64,
     /// Dispatches.
     pub dispatches: u32,
 }
 
-/// Adds the time of one dispatch to that of its stage.
-fn add_time(times: &mut Vec<StageTime>, stage: &'static str, seconds: f64) {
-    match times.iter_mut().find(|time| time.stage == stage) {
+/// Adds the time of one dispatch to that of its kernel.
+fn add_time(times: &mut Vec<KernelTime>, kernel: &'static str, seconds: f64) {
+    match times.iter_mut().find(|time| time.kernel == kernel) {
         Some(time) => {
             time.seconds += seconds;
             time.dispatches += 1;
         }
-        None => times.push(StageTime { stage, seconds, dispatches: 1 }),
+        None => times.push(KernelTime { kernel, seconds, dispatches: 1 }),
     }
 }
 
@@ -282,7 +282,7 @@ pub struct Recorder<'g> {
 
 struct Stepping {
     clock: fn() -> f64,
-    times: Vec<StageTime>,
+    times: Vec<KernelTime>,
 }
 
 struct Timing {
@@ -302,7 +302,7 @@ impl<'g> Recorder<'g> {
     }
 
     /// An empty recording of which every dispatch runs at once, alone, and takes the time by `clock`,
-    /// seconds. With a clock of CPU time this is what a stage costs on a CPU adapter, whatever else the
+    /// seconds. With a clock of CPU time this is what a kernel costs on a CPU adapter, whatever else the
     /// machine does.
     pub fn stepped(gpu: &'g Gpu, clock: fn() -> f64) -> Self {
         Self { stepping: Some(Stepping { clock, times: Vec::new() }), ..Self::new(gpu) }
@@ -313,7 +313,7 @@ impl<'g> Recorder<'g> {
         let mut recorder = Self::new(gpu);
         if gpu.has_timestamps() {
             let queries = gpu.device().create_query_set(&wgpu::QuerySetDescriptor {
-                label: Some("stage times"),
+                label: Some("kernel times"),
                 ty: wgpu::QueryType::Timestamp,
                 count: 2 * MAX_TIMED,
             });
@@ -328,12 +328,12 @@ impl<'g> Recorder<'g> {
     /// When the shader does not compile or a name is not one of its bindings.
     pub fn dispatch(
         &mut self,
-        stage: &'static str,
+        kernel: &'static str,
         size: Size<'_>,
         buffers: &[(&str, &wgpu::Buffer)],
     ) -> Result<()> {
         let gpu = self.gpu;
-        let compiled = gpu.stages().get(gpu, stage)?;
+        let compiled = gpu.kernels().get(gpu, kernel)?;
         let group = compiled.bind_group(gpu, buffers)?;
         let groups = match size {
             Size::Groups(groups) => Some(groups),
@@ -349,7 +349,7 @@ impl<'g> Recorder<'g> {
                 timing.untimed += 1;
                 return None;
             }
-            timing.names.push(stage);
+            timing.names.push(kernel);
             Some(wgpu::ComputePassTimestampWrites {
                 query_set: &timing.queries,
                 beginning_of_pass_write_index: Some(at),
@@ -358,13 +358,13 @@ impl<'g> Recorder<'g> {
         });
         let mut pass = self
             .encoder
-            .begin_compute_pass(&wgpu::ComputePassDescriptor { label: Some(stage), timestamp_writes });
+            .begin_compute_pass(&wgpu::ComputePassDescriptor { label: Some(kernel), timestamp_writes });
         pass.set_pipeline(&compiled.pipeline);
         pass.set_bind_group(0, &group, &[]);
         match (size, groups) {
             (Size::Indirect(args, slot), _) => pass.dispatch_workgroups_indirect(args, u64::from(slot) * 12),
             (_, Some(groups)) => {
-                // The same fold as `put` in the count_* stages.
+                // The same fold as `put` in the count_* kernels.
                 let x = groups.min(32_768);
                 pass.dispatch_workgroups(x, groups.div_ceil(x), 1);
             }
@@ -377,7 +377,7 @@ impl<'g> Recorder<'g> {
             gpu.wait()?;
             let seconds = clock() - before;
             if let Some(stepping) = &mut self.stepping {
-                add_time(&mut stepping.times, stage, seconds);
+                add_time(&mut stepping.times, kernel, seconds);
             }
         }
         Ok(())
@@ -405,11 +405,11 @@ impl<'g> Recorder<'g> {
         self.gpu.queue().submit([self.encoder.finish()]);
     }
 
-    /// Submits, waits, and gives the time of each stage in the order of first use.
+    /// Submits, waits, and gives the time of each kernel in the order of first use.
     ///
     /// # Errors
     /// When the device fails.
-    pub fn submit_timed(mut self) -> Result<Vec<StageTime>> {
+    pub fn submit_timed(mut self) -> Result<Vec<KernelTime>> {
         if let Some(stepping) = self.stepping.take() {
             let gpu = self.gpu;
             self.submit();
@@ -423,12 +423,12 @@ impl<'g> Recorder<'g> {
         if timing.untimed > 0 {
             tracing::warn!(
                 timing.untimed,
-                "dispatches beyond {MAX_TIMED} are not in the times of the stages"
+                "dispatches beyond {MAX_TIMED} are not in the times of the kernels"
             );
         }
         let count = 2 * timing.names.len() as u32;
         let resolved = self.gpu.device().create_buffer(&wgpu::BufferDescriptor {
-            label: Some("stage times"),
+            label: Some("kernel times"),
             size: u64::from(count.max(2)) * 8,
             usage: wgpu::BufferUsages::QUERY_RESOLVE | wgpu::BufferUsages::COPY_SRC,
             mapped_at_creation: false,
@@ -438,9 +438,9 @@ impl<'g> Recorder<'g> {
         self.submit();
         let ticks: Vec<u64> = gpu.read(&resolved, 0, count as usize)?;
         let period = f64::from(gpu.queue().get_timestamp_period()) * 1e-9;
-        let mut times: Vec<StageTime> = Vec::new();
-        for (pair, &stage) in ticks.chunks_exact(2).zip(&timing.names) {
-            add_time(&mut times, stage, pair[1].saturating_sub(pair[0]) as f64 * period);
+        let mut times: Vec<KernelTime> = Vec::new();
+        for (pair, &kernel) in ticks.chunks_exact(2).zip(&timing.names) {
+            add_time(&mut times, kernel, pair[1].saturating_sub(pair[0]) as f64 * period);
         }
         Ok(times)
     }

@@ -29,7 +29,7 @@ const OPACITY: f32 = 0.99;
 /// Empty when there are no points to enclose, or all of them lie in one place; and where a water takes more
 /// than half of its light: there the colour of open water ends the rays, and a shell would have a J of any
 /// colour, which shows through every hole of the surface once the water is taken away.
-pub(super) fn far_field(
+pub(super) fn background_gaussians(
     points: &Points,
     views: &[TrainView],
     sh_degree: u8,
@@ -132,7 +132,7 @@ mod tests {
     #[test]
     fn every_ray_of_every_view_ends_on_the_far_field() {
         let (points, views) = scene();
-        let shell = far_field(&points, &views, 1, 500, None);
+        let shell = background_gaussians(&points, &views, 1, 500, None);
         let deviation = f64::from(shell.log_scales[0][0].exp());
         for view in &views {
             let (camera, eye) = (&view.camera, view.pose.centre());
@@ -157,7 +157,7 @@ mod tests {
     #[test]
     fn it_lies_behind_the_points_but_not_behind_outliers() {
         let (points, views) = scene();
-        let shell = far_field(&points, &views, 0, 200, None);
+        let shell = background_gaussians(&points, &views, 0, 200, None);
         for mean in &shell.means {
             let distance = DVec3::from(mean.map(f64::from)).length();
             assert!((14.0..25.0).contains(&distance), "{distance}");
@@ -169,18 +169,20 @@ mod tests {
         let (points, views) = scene();
         let with = |blue: f64| {
             let water = Water { beta_d: [9.0, 0.5, blue], beta_b: [9.0; 3], b_inf: [0.1; 3] };
-            far_field(&points, &views, 0, 200, Some(&water))
+            background_gaussians(&points, &views, 0, 200, Some(&water))
         };
         // The shell is 12 to 18 units away, and half is left after ln 2 / 18 = 0.039 of attenuation a unit.
-        assert_eq!(with(0.02), far_field(&points, &views, 0, 200, None));
+        assert_eq!(with(0.02), background_gaussians(&points, &views, 0, 200, None));
         assert!(with(0.06).is_empty());
     }
 
     #[test]
     fn what_no_view_sees_is_left_out() {
         let (points, views) = scene();
-        let (both, one) =
-            (far_field(&points, &views, 0, 500, None), far_field(&points, &views[..1], 0, 500, None));
+        let (both, one) = (
+            background_gaussians(&points, &views, 0, 500, None),
+            background_gaussians(&points, &views[..1], 0, 500, None),
+        );
         assert!(both.len() < 500, "{} of 500", both.len());
         assert!(one.len() < both.len());
         assert!(one.means.iter().all(|mean| mean[2] > 0.0), "the first view looks along z");
@@ -189,7 +191,7 @@ mod tests {
     #[test]
     fn it_has_the_mean_colour_and_as_many_coefficients_as_the_degree_asks_for() {
         let (points, views) = scene();
-        let shell = far_field(&points, &views, 2, 100, None);
+        let shell = background_gaussians(&points, &views, 2, 100, None);
         assert_eq!(shell.sh_coeffs.len(), 9 * shell.len());
         let colour = shell.sh_coeffs[0].map(|value| 0.5 + SH_C0 * value);
         for (have, expected) in colour.iter().zip([10.0 / 21.0, 0.0, 0.2]) {
@@ -201,9 +203,9 @@ mod tests {
     #[test]
     fn a_scene_in_one_place_or_without_points_has_none() {
         let (points, views) = scene();
-        assert!(far_field(&points, &views, 0, 0, None).is_empty());
-        assert!(far_field(&Points::default(), &views, 0, 100, None).is_empty());
+        assert!(background_gaussians(&points, &views, 0, 0, None).is_empty());
+        assert!(background_gaussians(&Points::default(), &views, 0, 100, None).is_empty());
         let place = Points { positions: vec![[0.0; 3]; 5], colours: vec![[9; 3]; 5], ..Points::default() };
-        assert!(far_field(&place, &views[..1], 0, 100, None).is_empty());
+        assert!(background_gaussians(&place, &views[..1], 0, 100, None).is_empty());
     }
 }
