@@ -55,8 +55,6 @@ def rows_of(grid):
             with_settings("partition.extend_base=0", "partition.visibility_edge_factor=1", partitions=grid),
         ),
         (f"darws-loss-{grid}", f"{grid} DARWS, loss x w (SMP-UWGS +0.72 dB)", darws("loss_factor")),
-        (f"darws-density-{grid}", f"{grid} DARWS, caps x w", darws("density_threshold")),
-        (f"darws-iterations-{grid}", f"{grid} DARWS, iterations x w", darws("iteration_budget")),
         (f"darws-joint-{grid}", f"{grid} DARWS, global views by w", darws("joint")),
     ]
 

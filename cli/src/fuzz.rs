@@ -65,7 +65,7 @@ fn fuzzed_files_of_a_result_are_read_or_refused() {
         model::alignment(&model).is_ok_and(|rotation| rotation.is_normalized())
     };
     let plan =
-        br#"{"format": 3, "alignment": {"rule": "world_y", "world_to_aligned_quat_wxyz": [0.8, 0, 0.6, 0]}}"#;
+        br#"{"format": 4, "alignment": {"rule": "world_y", "world_to_aligned_quat_wxyz": [0.8, 0, 0.6, 0]}}"#;
     run(&Target::new("alignment of plan.json", vec![plan.to_vec()], &read));
 
     let read = |bytes: &[u8]| {

@@ -100,7 +100,7 @@ fn check_metrics(metrics: &Value) {
 
     let seconds = &metrics["seconds"];
     assert_eq!(number(seconds, "ingest"), 0.25);
-    for stage in ["plan", "global", "partitions", "merge", "evaluate"] {
+    for stage in ["plan", "global", "partition", "merge", "evaluate"] {
         assert!(number(seconds, stage) > 0.0, "{stage} took no time");
     }
     assert_eq!(number(metrics, "iterations"), 400.0);

@@ -1,4 +1,4 @@
-//! Stages of a job beside training. The global stage measures contributions, partitions agree on one water,
+//! Stages of a job beside training. Partitions agree on one water,
 //! and borders are trained after the merge. Losses of workers or coordinators change no byte. An evaluation
 //! includes its pictures.
 
@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use crate::support::{self, FakeTrainer, TestCluster, reason_of};
 use bytes::Bytes;
-use fathom_core::config::{CameraSelection, JobConfig, WaterPartitions};
+use fathom_core::config::{JobConfig, WaterPartitions};
 use fathom_core::gpu::{GpuOptions, device_for_test};
 use fathom_core::water::{Water, WaterRecord};
 use fathom_proto::v1;
@@ -268,58 +268,6 @@ async fn a_real_job_has_one_water_refined_or_frozen() {
         let agreed = serde_json::json!(refined)[number][0].as_f64().unwrap();
         assert!(agreed > of(0).min(of(1)) && agreed < of(0).max(of(1)), "{number}: {agreed} of {found:#}");
     }
-}
-
-#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn partitions_train_on_views_chosen_by_the_global_stage() {
-    let mut cluster = TestCluster::start().await;
-    let config = |columns: u32| {
-        let mut config = JobConfig::default();
-        config.partition.columns = columns;
-        config.partition.selection = CameraSelection::Contribution;
-        config.data.test_every = 5;
-        config.train.iterations = 400;
-        config
-    };
-    let worker = cluster.worker(FakeTrainer::quick());
-    let job = cluster.finished(&submit(&cluster, "selects", &config(2)).await).await;
-    assert_eq!(job.state(), v1::JobState::Succeeded, "{}", job.error);
-    let tasks: Vec<&str> = job.tasks.iter().map(|task| task.task_id.as_str()).collect();
-    assert_eq!(
-        tasks,
-        ["plan", "global", "select", "partition-0000", "partition-0001", "merge", "evaluate", "artifacts"]
-    );
-    let files = cluster.artifacts(&job.job_id).await;
-    let plan: Value = serde_json::from_slice(&files["plan.json"]).unwrap();
-    assert_eq!(plan["selection"], "contribution");
-    // The fake worker reports that even views show the first partition and odd ones the second; 0, 5, 10 and
-    // 15 are held out.
-    for (index, views) in [[2, 4, 6, 8, 12, 14], [1, 3, 7, 9, 11, 13]].into_iter().enumerate() {
-        let partition = &plan["partitions"][index];
-        assert_eq!(partition["chosen_views"], serde_json::json!(views));
-        assert_eq!((&partition["iterations"], &partition["mean_contribution"]), (&200.into(), &0.5.into()));
-        let task = &job.tasks[3 + index];
-        assert_eq!(task.progress.as_ref().unwrap().iterations, 200, "the task belongs to another plan");
-    }
-    worker.leave().await;
-
-    // Another worker takes over the global stage, and another coordinator chooses the views.
-    let disturbed = submit(&cluster, "disturbed", &config(2)).await;
-    let victim = cluster.worker(FakeTrainer::hangs_in(v1::Stage::Global));
-    cluster.wait_for(&disturbed, |job| job.tasks.iter().any(|task| task.checkpoint_iteration > 0)).await;
-    cluster.restart().await;
-    victim.kill();
-    let _successor = cluster.worker(FakeTrainer::quick());
-    let job = cluster.finished(&disturbed).await;
-    assert_eq!(job.state(), v1::JobState::Succeeded, "{}", job.error);
-    let again = cluster.artifacts(&disturbed).await;
-    for name in ["plan.json", "model.ply"] {
-        assert!(again[name] == files[name], "{name} differs");
-    }
-
-    let alone = cluster.finished(&submit(&cluster, "alone", &config(1)).await).await;
-    assert_eq!(alone.state(), v1::JobState::Succeeded, "{}", alone.error);
-    assert!(alone.tasks.iter().all(|task| task.stage() != v1::Stage::Select));
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

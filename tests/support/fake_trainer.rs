@@ -175,7 +175,7 @@ impl FakeTrainer {
             gaussians: n as u32,
             resumed_from,
             held_out: Vec::new(),
-            further: contributions(task, control)?,
+            further: Vec::new(),
         })
     }
 
@@ -216,21 +216,6 @@ impl FakeTrainer {
             further: Vec::new(),
         })
     }
-}
-
-/// Contributions of the views, if the spec asks: views of one parity show the partition equally, others not
-/// at all.
-fn contributions(task: &TaskInput, control: &dyn Control) -> Result<Vec<(Artifact, BlobRef)>, TaskError> {
-    let regions = if let Work::Global(spec) = &task.work { spec.regions.len() } else { 0 };
-    let (views, partitions) = (task.common.views.clone(), regions);
-    if partitions == 0 {
-        return Ok(Vec::new());
-    }
-    let share =
-        |view: u32, partition: usize| if (view as usize + partition).is_multiple_of(2) { 0.5 } else { 0.0 };
-    let shares = views.iter().flat_map(|&view| (0..partitions).map(move |k| share(view, k))).collect();
-    let said = worker_v1::Contributions { format: 1, views, partitions: partitions as u32, shares };
-    Ok(vec![(Artifact::Contributions, control.upload(Bytes::from(said.encode_to_vec()))?)])
 }
 
 /// Border measurements of the fake evaluation: a band with as many pixels as there are lines.

@@ -56,13 +56,6 @@ pub fn run(args: InspectArgs) -> Result<()> {
     for text in describe(&scene, &plan, &config.train, unseen) {
         output::lines(text);
     }
-    if config.partition.selection != plan.selection && plan.global.is_some() {
-        output::line(
-            "cameras, iterations and forecasts are based on visibility; they are chosen again after the \
-             coarse model"
-                .to_owned(),
-        );
-    }
     if !args.no_plan {
         output::line(format!("picture of the plan: {}", args.plan.display()));
     }

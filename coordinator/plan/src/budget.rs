@@ -18,9 +18,9 @@ use glam::DVec3;
 use crate::plan::{Forecast, GlobalStage};
 
 /// Fewest Gaussians that a run may have.
-pub const MIN_GAUSSIANS: f64 = 16.0;
+const MIN_GAUSSIANS: f64 = 16.0;
 /// Fewest iterations.
-pub const MIN_ITERATIONS: f64 = 1.0;
+const MIN_ITERATIONS: f64 = 1.0;
 
 /// Iterations of a partition with `chosen` of `training` cameras.
 pub fn iterations(config: &JobConfig, chosen: usize, training: usize) -> u32 {

@@ -7,8 +7,7 @@
 //!    frame (y down, x-z horizontal).
 //! 2. `cells`: cameras assigned by rank, and rectangles that tile the plane: a grid, or the choice of `auto`.
 //! 3. `region`: the extended box of each cell and the points in it.
-//! 4. `selection` and `visibility`: the cameras that see enough of that box. `contribution` selects them
-//!    again by their share of the coarse model, once that is trained.
+//! 4. `selection` and `visibility`: the cameras that see enough of that box.
 //! 5. `weights`: the weight of each partition, and its effects.
 //! 6. `budget`: iterations, Gaussians and memory of each run.
 //! 7. `borders`: the borders between cells, and the training there after the merge.
@@ -20,7 +19,6 @@ mod auto;
 mod borders;
 mod budget;
 mod cells;
-mod contribution;
 #[cfg(test)]
 mod fuzz;
 mod geometry;
@@ -35,7 +33,7 @@ mod up_axis;
 mod visibility;
 mod weights;
 
-use fathom_core::config::{CameraSelection, JobConfig, Medium, TrainConfig, WeightMode};
+use fathom_core::config::{JobConfig, Medium, TrainConfig, WeightMode};
 use fathom_core::floaters;
 use fathom_core::scene::{PinholeCamera, Points, Pose, viewing_distance};
 use fathom_core::views::TrainView;
@@ -43,7 +41,6 @@ use glam::DVec3;
 use rayon::prelude::*;
 
 pub use auto::Connected;
-pub use contribution::Contributions;
 pub use geometry::*;
 pub use plan::*;
 pub use selection::MIN_CAMERAS;
@@ -111,12 +108,6 @@ pub enum PlanError {
         /// Rows asked for.
         rows: u32,
     },
-    /// Contributions for other views or partitions than the plan's.
-    #[error(
-        "the contributions are for other views or partitions than the plan's; use a coordinator and workers of one \
-         version from the plan to the end"
-    )]
-    OtherContributions,
     /// Training starts from sparse points and there are none.
     #[error(
         "the scene has no sparse points to start from; export it with its point cloud (COLMAP: points3D, \
@@ -131,35 +122,6 @@ pub enum PlanError {
 /// When the input cannot be cut as configured; the message names a remedy.
 pub fn plan(input: &PlanInput<'_>) -> Result<Plan, PlanError> {
     plan_for(input, Connected::default())
-}
-
-/// The plan `first` of this input, with cameras selected by their contribution in the coarse model. Views and
-/// values that depend on their number are new; all else stays.
-///
-/// # Errors
-/// When `contributions` are not of this plan's partitions and training views.
-pub fn plan_by_contribution(
-    input: &PlanInput<'_>,
-    first: &Plan,
-    contributions: &Contributions,
-) -> Result<Plan, PlanError> {
-    if first.views as usize != input.views.len() {
-        return Err(PlanError::OtherContributions);
-    }
-    let training: Vec<usize> = first.training_views().into_iter().map(|view| view as usize).collect();
-    let candidates = candidates(input.views, &training, &first.alignment);
-    let points = AlignedPoints::in_frame(input.points, &first.alignment);
-    let mut partitions = first.partitions.clone();
-    // Weights act on the values without weights.
-    partitions.iter_mut().for_each(|p| p.max_gaussians = p.weighed.unweighed_max_gaussians);
-    choose_again(&mut partitions, contributions, &candidates, input.config)?;
-    finish(&mut partitions, &candidates, &points, first.global.as_ref(), input.config);
-    Ok(Plan {
-        selection: CameraSelection::Contribution,
-        balance: Balance::of(&partitions),
-        partitions,
-        ..first.clone()
-    })
 }
 
 /// Cuts the scene, with `partition.auto` for these workers.
@@ -239,7 +201,6 @@ pub fn plan_for(input: &PlanInput<'_>, connected: Connected) -> Result<Plan, Pla
         points: points.all().len() as u64,
         global,
         balance: Balance::of(&partitions),
-        selection: CameraSelection::Visibility,
         weights: config.partition.weights,
         partitions,
         borders,
@@ -481,14 +442,13 @@ fn partition(
         iterations,
         filled_views: chosen.filled,
         mean_visibility: chosen.mean_visibility,
-        mean_contribution: None,
         chosen_views: chosen.views,
         focus_points: focus.len() as u64,
         cell_points,
         r_focus,
         depth: selection::mean_depth(&own, &focus),
         weight: 0.0,
-        weighed: Weighed::nothing(iterations, max_gaussians),
+        weighed: Weighed::default(),
         max_gaussians,
         forecast: Forecast::default(),
     }
@@ -506,31 +466,6 @@ fn finish(
     partitions.par_iter_mut().for_each(|partition| {
         partition.forecast = forecast(partition, candidates, points, global, config);
     });
-}
-
-/// Selects the views of all partitions by their contribution, and updates the values that depend on their
-/// number.
-fn choose_again(
-    partitions: &mut [Partition],
-    contributions: &Contributions,
-    candidates: &[Candidate],
-    config: &JobConfig,
-) -> Result<(), PlanError> {
-    let training: Vec<u32> = candidates.iter().map(|candidate| candidate.view).collect();
-    let mut known = contributions.views().to_vec();
-    known.sort_unstable();
-    if known != training || contributions.partitions() != partitions.len() {
-        return Err(PlanError::OtherContributions);
-    }
-    let least = config.partition.contribution;
-    partitions.par_iter_mut().enumerate().for_each(|(index, partition)| {
-        let choice = contribution::choose(contributions, index, &training, &partition.base_views, least);
-        partition.iterations = budget::iterations(config, choice.views.len(), training.len());
-        partition.filled_views = choice.filled;
-        partition.mean_contribution = Some(choice.mean_contribution);
-        partition.chosen_views = choice.views;
-    });
-    Ok(())
 }
 
 /// The forecast of a partition's run, once its views, iterations and cap are known.
@@ -551,7 +486,7 @@ fn forecast(
     } else {
         Vec::new()
     };
-    let share = f64::from(partition.weighed.unweighed_max_gaussians) / f64::from(config.train.max_gaussians);
+    let share = f64::from(partition.max_gaussians) / f64::from(config.train.max_gaussians);
     let frozen =
         global.map_or(0.0, |stage| f64::from(stage.max_gaussians) * (1.0 - share).max(0.0)).round() as u64;
     let is_chosen = |view| partition.chosen_views.binary_search(&view).is_ok();

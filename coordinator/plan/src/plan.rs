@@ -7,7 +7,7 @@
 
 use std::fmt;
 
-use fathom_core::config::{CameraSelection, WeightMode};
+use fathom_core::config::WeightMode;
 use fathom_core::memory::MemoryForecast;
 use fathom_core::scene::learning_scale;
 use serde::{Deserialize, Serialize};
@@ -15,7 +15,7 @@ use serde::{Deserialize, Serialize};
 use crate::geometry::{Alignment, Box3, Rect, Segment};
 
 /// Version of the layout that this program writes and reads.
-pub const PLAN_FORMAT: u32 = 3;
+pub const PLAN_FORMAT: u32 = 4;
 
 /// The partitions of a scene, their photographs, and the forecast of their runs.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -43,9 +43,6 @@ pub struct Plan {
     pub global: Option<GlobalStage>,
     /// Balance of the work.
     pub balance: Balance,
-    /// How the cameras of the partitions were selected. A job that requests `contribution` has a plan by
-    /// `visibility` until its coarse model is trained.
-    pub selection: CameraSelection,
     /// The effect of the weights of the partitions.
     pub weights: WeightMode,
     /// All partitions; entry `k` has id `k`. A grid goes column by column, each from low to high z; a
@@ -188,18 +185,13 @@ pub struct Partition {
     pub extended_box: Box3,
     /// Training views that are its own by rank, ascending.
     pub base_views: Vec<u32>,
-    /// Training views that it trains on, ascending. With `visibility` they include all of `base_views`, with
-    /// `contribution` only those that show part of it.
+    /// Training views that it trains on, ascending; all of `base_views` and those that see enough of
+    /// `extended_box`.
     pub chosen_views: Vec<u32>,
     /// Number of selected views below the threshold, added to reach the minimum.
     pub filled_views: u32,
-    /// Mean share of the image that the extended box covers, over the views chosen by visibility (r of eq.
-    /// 5).
+    /// Mean share of the image that the extended box covers, over the chosen views (r of eq. 5).
     pub mean_visibility: f64,
-    /// Mean share of the picture that shows surfaces of the coarse model in `focus`, over the chosen views;
-    /// absent where they are chosen by visibility.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub mean_contribution: Option<f64>,
     /// Sparse points in `focus`.
     pub focus_points: u64,
     /// Sparse points in `cell`.
@@ -226,27 +218,15 @@ pub struct Partition {
 pub struct Weighed {
     /// Factor on the whole loss of its run; 1 without effect.
     pub loss_factor: f64,
-    /// Factor on the gradient threshold of `classic`; 1 without effect.
-    pub gradient_factor: f64,
     /// Sampling weight of its own views in the global stage, relative to the mean over all views; 1 where all
     /// are equal.
     pub sampling: f64,
-    /// Its iterations without weights.
-    pub unweighed_iterations: u32,
-    /// Its cap without weights.
-    pub unweighed_max_gaussians: u32,
 }
 
-impl Weighed {
-    /// No effect, for a partition with these budgets.
-    pub fn nothing(iterations: u32, max_gaussians: u32) -> Self {
-        Self {
-            loss_factor: 1.0,
-            gradient_factor: 1.0,
-            sampling: 1.0,
-            unweighed_iterations: iterations,
-            unweighed_max_gaussians: max_gaussians,
-        }
+impl Default for Weighed {
+    /// No effect.
+    fn default() -> Self {
+        Self { loss_factor: 1.0, sampling: 1.0 }
     }
 }
 

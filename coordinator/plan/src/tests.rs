@@ -1,6 +1,6 @@
 use std::collections::{BTreeMap, BTreeSet};
 
-use fathom_core::config::{Strategy, WaterConfig};
+use fathom_core::config::WaterConfig;
 use fathom_core::rng::{Stream, uniform_at};
 use fathom_core::seams::Axis;
 use glam::DQuat;
@@ -10,7 +10,6 @@ use super::*;
 
 mod auto;
 mod border_stage;
-mod by_contribution;
 mod by_weight;
 mod faults;
 mod neighbours;

@@ -4,7 +4,7 @@ use fathom_core::config::JobConfig;
 use fathom_core::scene::{BlobRef, Camera, CameraModel, Manifest, ManifestView, PinholeCamera, Points, Pose};
 use fathom_core::views::TrainView;
 use fathom_fuzz::{Target, run};
-use fathom_plan::{Contributions, Plan, PlanInput, plan};
+use fathom_plan::{Plan, PlanInput, plan};
 use fathom_proto::worker::v1;
 use glam::DVec3;
 use prost::Message;
@@ -159,13 +159,6 @@ fn fuzzed_measurements_of_workers_are_taken_or_refused() {
         true
     };
     run(&Target::new("Refined", vec![refined.encode_to_vec()], &read));
-
-    let said = v1::Contributions { format: 1, views: vec![0, 2, 3], partitions: 2, shares: vec![0.5; 6] };
-    let read = |bytes: &[u8]| {
-        let Ok(said) = v1::Contributions::decode(bytes) else { return false };
-        Contributions::new(said.views, said.partitions, said.shares).is_ok()
-    };
-    run(&Target::new("Contributions", vec![said.encode_to_vec()], &read));
 
     let metrics = v1::ViewMetrics {
         name: "left/a.jpg".into(),

@@ -104,7 +104,7 @@ fn fuzzed_messages_of_workers_are_decoded_or_refused() {
     fuzz(worker::SessionRequest { renewal: Some(renewal.clone()) });
     fuzz(renewal);
     fuzz(worker::CheckpointRequest { lease: lease(), blob: blob(), iteration: 7 });
-    let named = worker::NamedBlob { artifact: worker::Artifact::Contributions.into(), blob: blob() };
+    let named = worker::NamedBlob { artifact: worker::Artifact::Evaluation.into(), blob: blob() };
     fuzz(worker::CompleteRequest {
         lease: lease(),
         result: blob(),
@@ -147,10 +147,9 @@ fn fuzzed_specifications_of_tasks_are_decoded_or_refused() {
         clear_ranges: vec![0.0, 3.5],
         ..Default::default()
     };
-    let regions = vec![worker::FocusBox::default(); 2];
     let focus = Some(worker::FocusBox::default());
     for work in [
-        Work::Global(worker::GlobalSpec { view_weights: vec![1.0, 2.0], regions }),
+        Work::Global(worker::GlobalSpec { view_weights: vec![1.0, 2.0] }),
         Work::Partition(worker::PartitionSpec {
             index: 3,
             focus,

@@ -294,19 +294,14 @@ fn training_history(view: &JobView) -> Vec<Value> {
     done.flat_map(|(task, history)| history.iter().map(move |m| row(task, m))).collect()
 }
 
-/// Wall time of each stage; 0 for a stage that was skipped. The plan includes the selection of cameras;
-/// partitions include both parts and the consensus between.
+/// Wall time of the submission and of each stage before this one; 0 for a stage that was skipped.
 fn seconds_json(job: &JobRecord) -> Value {
-    let seconds = |stage: Stage| job.stage_seconds.get(&stage).copied().unwrap_or(0.0);
-    json!({
-        "ingest": job.ingest_seconds,
-        "plan": seconds(Stage::Plan) + seconds(Stage::Select),
-        "global": seconds(Stage::Global),
-        "partitions": seconds(Stage::FirstPart) + seconds(Stage::Exchange) + seconds(Stage::Partition),
-        "merge": seconds(Stage::Merge),
-        "borders": seconds(Stage::Borders),
-        "evaluate": seconds(Stage::Evaluate),
-    })
+    let stages = Stage::all().filter(|stage| *stage < Stage::Artifacts);
+    let seconds = |stage: Stage| json!(job.stage_seconds.get(&stage).copied().unwrap_or(0.0));
+    let of_stages = stages.map(|stage| (stage.name().to_owned(), seconds(stage)));
+    Value::Object(
+        std::iter::once(("ingest".to_owned(), json!(job.ingest_seconds))).chain(of_stages).collect(),
+    )
 }
 
 /// Everything that determined the result: inputs by digest, configuration, seed, versions, and the worker of

@@ -1,4 +1,4 @@
-//! The coordinator's own tasks, one file each: `plan`, `select`, `exchange`, `merge`, `artifacts`.
+//! The coordinator's own tasks, one file each: `plan`, `exchange`, `merge`, `artifacts`.
 //!
 //! They have leases like all others. When the process is killed during one, the next process releases it
 //! (`Store::recover`) and runs it again from its beginning. Each is a function of its job's input and of
@@ -10,7 +10,6 @@ pub mod exchange;
 pub mod input;
 mod merge;
 mod plan;
-mod select;
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -124,7 +123,6 @@ async fn execute(shared: &State, grant: &Grant) -> Result<TaskOutput, OwnTaskErr
     let objects = shared.objects.of(&view.job.tenant)?;
     match grant.lease.task.stage {
         Stage::Plan => plan::plan_job(&objects, &view.job, shared.workers.connected(&view.job.tenant)).await,
-        Stage::Select => select::choose(&objects, &view).await,
         Stage::Exchange => exchange::find(&objects, &view).await,
         Stage::Merge => merge::merge_job(&objects, &view, &grant.lease).await,
         Stage::Artifacts => artifacts::assemble(&objects, &view).await,

@@ -3,10 +3,10 @@
 
 use std::collections::BTreeMap;
 
-use fathom_core::config::{CameraSelection, JobConfig, Method, WaterPartitions};
+use fathom_core::config::{JobConfig, Method, WaterPartitions};
 use fathom_core::scene::{Manifest, Points};
 use fathom_core::seams::{self, Axis};
-use fathom_plan::{Connected, Plan, PlanError, PlanInput, Rect, picture, plan_for};
+use fathom_plan::{Connected, Plan, PlanInput, Rect, picture, plan_for};
 use fathom_proto::worker::v1::task_spec::Work;
 use fathom_proto::worker::v1::{
     BordersSpec, CommonSpec, EvaluateSpec, FocusBox, GlobalSpec, PartitionSpec, SeamLine, SeamLines, TaskSpec,
@@ -31,8 +31,7 @@ pub async fn plan_job(
     let input = JobInput::read(objects, job).await?;
     require_uploads(objects, &input.manifest).await?;
     let config = input.config.clone();
-    let cut = move |input: &PlanInput<'_>| plan_for(input, connected);
-    let Drawn { plan, plan_json, plan_png } = draw(objects, job, input, cut).await?;
+    let Drawn { plan, plan_json, plan_png } = draw(objects, job, input, connected).await?;
     tracing::info!(job = %job.job_id, partitions = plan.partitions.len(), reason = plan.cut.reason, "partitioned the scene");
     let mut warnings = plan.warnings(&config.train);
     if config.water.partitions == WaterPartitions::Joint
@@ -46,9 +45,6 @@ pub async fn plan_job(
     if config.borders.enabled && plan.borders.is_none() {
         warnings.push("borders.enabled has no effect here: it needs more than one partition".into());
     }
-    if config.partition.selection == CameraSelection::Contribution && plan.global.is_none() {
-        warnings.push("partition.selection has no effect here: it needs more than one partition".into());
-    }
     if config.partition.auto && connected.workers == 0 && config.partition.workers == 0 {
         warnings.push(
             "no worker was connected when the scene was partitioned, so the plan is for one; start workers first, or set \
@@ -59,21 +55,17 @@ pub async fn plan_job(
     let mut tasks = put_partitions(objects, &plan, &config).await?;
     let own = |stage: Stage| (stage.task(), PlannedTask::default());
     if let Some(stage) = &plan.global {
-        let select = config.partition.selection == CameraSelection::Contribution;
-        let boxes = plan.partitions.iter().map(|partition| box_on_plane(&plan, &partition.focus));
         let common = CommonSpec {
             iterations: stage.iterations,
             max_gaussians: stage.max_gaussians,
             held_out: measured(&plan, &config),
             ..common_spec(&plan, &plan.training_views(), stage.max_resolution)
         };
-        let regions = if select { boxes.collect() } else { Vec::new() };
-        let work = Work::Global(GlobalSpec { view_weights: plan.view_weights(), regions });
+        let work = Work::Global(GlobalSpec { view_weights: plan.view_weights() });
         tasks.insert(
             Stage::Global.task(),
             put_spec(objects, config.method, common, work, stage.forecast.bytes).await?,
         );
-        tasks.extend(select.then(|| own(Stage::Select)));
     }
     if tasks.keys().any(|task| task.stage == Stage::FirstPart) {
         tasks.extend([own(Stage::Exchange)]);
@@ -101,18 +93,18 @@ pub async fn plan_job(
 }
 
 /// A plan, as JSON and as a picture.
-pub struct Drawn {
-    pub plan: Plan,
-    pub plan_json: Vec<u8>,
-    pub plan_png: Vec<u8>,
+struct Drawn {
+    plan: Plan,
+    plan_json: Vec<u8>,
+    plan_png: Vec<u8>,
 }
 
-/// Plans the scene of a job with `plan`, on a thread for blocking work.
-pub async fn draw(
+/// Plans the scene of a job, on a thread for blocking work.
+async fn draw(
     objects: &BlobStore,
     job: &JobRecord,
     input: JobInput,
-    plan: impl FnOnce(&PlanInput<'_>) -> Result<Plan, PlanError> + Send + 'static,
+    connected: Connected,
 ) -> Result<Drawn, OwnTaskError> {
     let points = objects.read(&input.manifest.points).await?;
     let title = job.name.clone();
@@ -120,7 +112,7 @@ pub async fn draw(
         let points = Points::from_bytes(&points).map_err(|e| OwnTaskError::input(e.to_string()))?;
         let views = input.views()?;
         let plan_input = PlanInput { views: &views, points: &points, config: &input.config };
-        let plan = plan(&plan_input).map_err(|e| OwnTaskError::input(e.to_string()))?;
+        let plan = plan_for(&plan_input, connected).map_err(|e| OwnTaskError::input(e.to_string()))?;
         plan.require_points().map_err(|e| OwnTaskError::input(e.to_string()))?;
         let plan_json = serde_json::to_vec_pretty(&plan).map_err(|e| OwnTaskError::failed(e.to_string()))?;
         let plan_png = picture::draw(&plan, &views, &points, &title).map_err(OwnTaskError::failed)?;
@@ -152,16 +144,16 @@ fn measured(plan: &Plan, config: &JobConfig) -> Vec<u32> {
 }
 
 /// The tasks of all partitions: the first part before the exchange, if there is one, and the rest.
-pub async fn put_partitions(
+async fn put_partitions(
     objects: &BlobStore,
     plan: &Plan,
     config: &JobConfig,
 ) -> Result<BTreeMap<TaskId, PlannedTask>, OwnTaskError> {
-    let factor = |factor: f64| (factor != 1.0).then_some(factor as f32);
     let count = plan.partitions.len() as u32;
     let mut tasks = BTreeMap::new();
     for partition in &plan.partitions {
         let (index, memory_bytes) = (partition.id.0, partition.forecast.bytes);
+        let loss_factor = partition.weighed.loss_factor;
         let mut common = CommonSpec {
             iterations: partition.iterations,
             max_gaussians: partition.max_gaussians,
@@ -171,8 +163,7 @@ pub async fn put_partitions(
         let mut work = PartitionSpec {
             index,
             focus: plan.global.is_some().then(|| box_on_plane(plan, &partition.focus)),
-            loss_factor: factor(partition.weighed.loss_factor),
-            gradient_factor: factor(partition.weighed.gradient_factor),
+            loss_factor: (loss_factor != 1.0).then_some(loss_factor as f32),
             cell: None,
             neighbours: Vec::new(),
         };

@@ -40,11 +40,10 @@ pub struct PlannedTask {
     pub memory_bytes: u64,
 }
 
-/// The tasks from a plan, or from a later selection of cameras.
+/// The tasks of a plan.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Planned {
-    /// By name. A plan has all tasks of all later stages; a selection of cameras only those of the
-    /// partitions.
+    /// By name: all tasks of all later stages.
     pub tasks: BTreeMap<TaskId, PlannedTask>,
     /// Warnings for the user.
     pub warnings: Vec<String>,
@@ -57,7 +56,7 @@ pub struct TaskOutput {
     pub made: BTreeMap<Artifact, BlobRef>,
     /// Its statistics.
     pub stats: TaskStats,
-    /// The planned tasks; for a plan and for a selection of cameras.
+    /// The planned tasks; only for a plan.
     pub planned: Option<Planned>,
 }
 
@@ -76,7 +75,7 @@ impl PlannedTask {
 }
 
 impl TaskOutput {
-    /// The output of a plan, or of a selection of cameras, which replaces the plan.
+    /// The output of a plan.
     pub fn planned(plan: BlobRef, picture: BlobRef, planned: Planned) -> Self {
         let made = BTreeMap::from([(Artifact::Plan, plan), (Artifact::PlanPicture, picture)]);
         Self { made, stats: TaskStats::default(), planned: Some(planned) }

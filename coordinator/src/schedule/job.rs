@@ -1,11 +1,11 @@
 //! A job as it is stored.
 //!
 //! ```text
-//!  PLAN ─► GLOBAL ─► SELECT ─► FIRST_PART ─► EXCHANGE ─► PARTITION ─► MERGE ─► BORDERS ─► EVALUATE ─► ARTIFACTS ─► succeeded
+//!  PLAN ─► GLOBAL ─► FIRST_PART ─► EXCHANGE ─► PARTITION ─► MERGE ─► BORDERS ─► EVALUATE ─► ARTIFACTS ─► succeeded
 //!
 //!  A job goes to the next stage that it has when all tasks of the present one are done. `stages.rs` says what each stage does;
-//!  the plan decides which a job has: GLOBAL for several partitions, SELECT where cameras are chosen by the coarse model,
-//!  FIRST_PART and EXCHANGE where partitions exchange something, BORDERS with `borders.enabled`, EVALUATE where views are held out.
+//!  the plan decides which a job has: GLOBAL for several partitions, FIRST_PART and EXCHANGE
+//!  where partitions exchange something, BORDERS with `borders.enabled`, EVALUATE where views are held out.
 //!
 //!  from every stage: a dead task ──► FAILED, the user ──► CANCELLED; the user ──► PAUSED ──► back to the stage
 //!  MERGE, where results of partitions are lost ──► back to PARTITION, for those

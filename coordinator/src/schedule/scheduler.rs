@@ -12,7 +12,7 @@ use super::job::{JobRecord, JobShape, JobState};
 use super::lost_results::requeue_lost;
 use super::rows::{JobRows, Rules, attempt_event, end_job, given_up, task_event};
 use super::task::{Attempt, CheckpointRecord, Lease, TaskRecord, TaskState};
-use super::{RunsOn, STAGES, Stage, TaskId};
+use super::{RunsOn, Stage, TaskId};
 
 /// The task rows that an event needs.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -28,8 +28,6 @@ pub fn rows_needed(job: &JobRecord, event: &Event) -> RowsNeeded {
     match event {
         Event::Claim { task, .. } => RowsNeeded::Some(vec![*task]),
         Event::Checkpoint { lease, .. } | Event::Release { lease, .. } => RowsNeeded::Some(vec![lease.task]),
-        // The tasks trained after a selection of cameras may be several stages ahead.
-        Event::Complete { lease, .. } if lease.task.stage == Stage::Select => RowsNeeded::All,
         Event::Complete { lease, .. } => {
             let mut tasks = vec![lease.task];
             tasks.extend(successors(&job.shape, lease.task));
@@ -251,7 +249,7 @@ fn complete(
     rules: &Rules,
 ) -> Result<Outcome, Refusal> {
     let task = lease.task;
-    let Some(result) = result_of(task, &output, &rows.job.shape) else {
+    let Some(result) = result_of(task, &output) else {
         return Err(Refusal::WrongOutput(task));
     };
     let TaskOutput { made, stats, planned } = output;
@@ -287,10 +285,7 @@ fn complete(
         }
     }
     if let Some(planned) = planned {
-        match task.stage {
-            Stage::Plan => accept_plan(rows, planned, &mut events),
-            _ => accept_choice(rows, planned, &mut events),
-        }
+        accept_plan(rows, planned, &mut events);
     }
     if rows.job.open_tasks == 0 {
         enter_next_stage(rows, now_ms, &mut events);
@@ -300,26 +295,16 @@ fn complete(
 }
 
 /// The result of a task; `None` if the output does not fit its stage.
-fn result_of(task: TaskId, output: &TaskOutput, shape: &JobShape) -> Option<BlobRef> {
+fn result_of(task: TaskId, output: &TaskOutput) -> Option<BlobRef> {
     let spec = task.stage.spec();
     let is_whole = match spec.runs_on {
         RunsOn::Coordinator => spec.outputs.iter().all(|artifact| output.made.contains_key(artifact)),
         RunsOn::Worker => true,
     };
     let is_declared = output.made.keys().all(|artifact| spec.outputs.contains(artifact));
-    let plans_what_it_may = match (task.stage, &output.planned) {
-        (Stage::Plan, Some(_)) => true,
-        // The tasks of all partitions wait for it.
-        (Stage::Select, Some(planned)) => {
-            let wanted = STAGES.iter().filter(|spec| spec.per_partition);
-            let wanted: Vec<TaskId> = wanted.flat_map(|spec| shape.tasks_of(spec.stage)).collect();
-            planned.tasks.keys().copied().eq(wanted)
-        }
-        (Stage::Plan | Stage::Select, None) => false,
-        (_, planned) => planned.is_none(),
-    };
+    let is_planned = (task.stage == Stage::Plan) == output.planned.is_some();
     let result = output.made.get(&task.stage.result())?;
-    (is_whole && is_declared && plans_what_it_may).then(|| result.clone())
+    (is_whole && is_declared && is_planned).then(|| result.clone())
 }
 
 /// Gives the job the tasks of its plan, all blocked.
@@ -333,20 +318,6 @@ fn accept_plan(rows: &mut JobRows, planned: Planned, events: &mut Vec<EventBody>
             .insert(task, TaskRecord { method, memory_bytes, ..TaskRecord::new(task, spec, iterations) });
     }
     events.extend(planned.warnings.into_iter().map(|message| EventBody::Warning { message }));
-}
-
-/// Replaces the tasks of the first plan by those of the final one, before any of them is trained.
-fn accept_choice(rows: &mut JobRows, chosen: Planned, events: &mut Vec<EventBody>) {
-    for (task, planned) in chosen.tasks {
-        if let Some(record) = rows.tasks.get_mut(&task) {
-            let total = rows.job.iterations_total + u64::from(planned.iterations);
-            rows.job.iterations_total = total.saturating_sub(record.iterations.into());
-            record.iterations = planned.iterations;
-            record.spec = planned.spec;
-            record.memory_bytes = planned.memory_bytes;
-        }
-    }
-    events.extend(chosen.warnings.into_iter().map(|message| EventBody::Warning { message }));
 }
 
 fn enter_next_stage(rows: &mut JobRows, now_ms: u64, events: &mut Vec<EventBody>) {

@@ -11,8 +11,6 @@
 //! - Only running leases change anything, and a task has at most two.
 //! - Where the job has first parts (every other seed), partitions begin under a consensus, each from the
 //!   result of its own first part.
-//! - Where cameras follow from the coarse model (every third seed), nothing is trained before their
-//!   selection, and all of it by that selection.
 //! - The model is that of the merge until borders are refined, where they are (every fifth seed).
 //! - Fences rise, and attempts stay within budgets.
 //! - No task of a paused job is assigned, and no more at a time than the job's limit.
@@ -387,9 +385,6 @@ impl Simulation {
         if self.rows.job.shape.stages.contains(&Stage::Exchange) {
             faults.extend(self.faults_of_consensus());
         }
-        if self.rows.job.shape.stages.contains(&Stage::Select) {
-            faults.extend(self.faults_of_choice());
-        }
         faults.extend(self.faults_of_the_model());
         let open = self.rows.job.shape.tasks_of(self.rows.job.stage);
         let open =
@@ -401,36 +396,6 @@ impl Simulation {
             faults.push("nothing will ever happen to the job again".into());
         }
         self.violations.extend(faults);
-    }
-
-    /// Faults of the tasks after a selection of cameras.
-    fn faults_of_choice(&self) -> Vec<String> {
-        let mut faults = Vec::new();
-        let chosen = self.done.get(&Stage::Select.task());
-        let plan = chosen.or(self.done.get(&Stage::Plan.task()));
-        if self.rows.job.output(Artifact::Plan) != plan {
-            faults.push(format!(
-                "the job has the plan {:?}, not {plan:?}",
-                self.rows.job.output(Artifact::Plan)
-            ));
-        }
-        for (task, record) in &self.rows.tasks {
-            if task.partition.is_none() {
-                continue;
-            }
-            if record.attempts > 0 && chosen.is_none() {
-                faults.push(format!("{task} began before its cameras were chosen"));
-            }
-            let is_new = record.spec.as_ref().is_some_and(|spec| spec.digest.starts_with("chosen"));
-            if is_new != chosen.is_some() || record.iterations != if is_new { 7 } else { 10 } {
-                faults.push(format!("{task} has {:?} with {} iterations", record.spec, record.iterations));
-            }
-        }
-        let total: u32 = self.rows.tasks.values().map(|record| record.iterations).sum();
-        if self.rows.job.iterations_total != u64::from(total) {
-            faults.push(format!("{} iterations in all, not {total}", self.rows.job.iterations_total));
-        }
-        faults
     }
 
     /// Faults of the two tasks of a partition and the exchange between them.
@@ -506,7 +471,7 @@ impl Simulation {
 }
 
 fn output(task: TaskId, result: BlobRef, seed: u32) -> TaskOutput {
-    let (refines, selects, borders) = (seed % 2 == 1, seed.is_multiple_of(3), seed.is_multiple_of(5));
+    let (refines, borders) = (seed % 2 == 1, seed.is_multiple_of(5));
     match task.stage {
         Stage::Plan => {
             let own = |stage: Stage| (stage.task(), PlannedTask::default());
@@ -514,7 +479,6 @@ fn output(task: TaskId, result: BlobRef, seed: u32) -> TaskOutput {
             let mut tasks = BTreeMap::from([own(Stage::Merge), own(Stage::Artifacts)]);
             tasks.insert(Stage::Global.task(), planned("global"));
             tasks.insert(Stage::Evaluate.task(), PlannedTask::new(blob("evaluate".into()), 0));
-            tasks.extend(selects.then(|| own(Stage::Select)));
             tasks.extend(refines.then(|| own(Stage::Exchange)));
             tasks.extend(borders.then(|| (Stage::Borders.task(), planned("borders"))));
             for k in 0..6 {
@@ -524,18 +488,6 @@ fn output(task: TaskId, result: BlobRef, seed: u32) -> TaskOutput {
                 tasks.insert(Stage::Partition.task_of(k), planned(&format!("partition {k}")));
             }
             TaskOutput::planned(result, blob("picture".into()), Planned { tasks, warnings: Vec::new() })
-        }
-        Stage::Select => {
-            let planned = |name: String| PlannedTask::new(blob(name), 7);
-            let mut tasks = BTreeMap::new();
-            for k in 0..6 {
-                if refines {
-                    tasks.insert(Stage::FirstPart.task_of(k), planned(format!("chosen first of {k}")));
-                }
-                tasks.insert(Stage::Partition.task_of(k), planned(format!("chosen {k}")));
-            }
-            let planned = Planned { tasks, warnings: vec!["a warning".into()] };
-            TaskOutput::planned(result, blob("chosen picture".into()), planned)
         }
         Stage::Merge => TaskOutput::merged(result, blob("report".into()), TaskStats::default()),
         stage => TaskOutput::of(stage, result, TaskStats::default()),
@@ -554,7 +506,7 @@ fn thousands_of_seeds_commit_each_task_once_by_a_live_lease() {
 }
 
 fn simulate(seeds: u32) {
-    let (mut stale, mut silent, mut succeeded, mut agreed, mut chose, mut refined) = (0, 0, 0, 0, 0, 0);
+    let (mut stale, mut silent, mut succeeded, mut agreed, mut refined) = (0, 0, 0, 0, 0);
     let (mut pauses, mut retries, mut rivals, mut ahead, mut lost) = (0, 0, 0, 0, 0);
     for seed in 0..seeds {
         let end = Simulation::new(seed, false).run();
@@ -567,7 +519,6 @@ fn simulate(seeds: u32) {
         lost += end.lost;
         ahead += end.rivals.1;
         agreed += u32::from(end.rows.job.output(Artifact::Exchange).is_some());
-        chose += u32::from(end.done.contains_key(&Stage::Select.task()));
         refined += u32::from(end.done.contains_key(&Stage::Borders.task()));
         succeeded += u32::from(end.rows.job.state == JobState::Succeeded);
         let tasks: BTreeSet<TaskId> = end.rows.tasks.keys().copied().collect();
@@ -585,7 +536,6 @@ fn simulate(seeds: u32) {
     assert!(lost > seeds / 10, "only {lost} results were lost");
     assert!(pauses > seeds && retries > seeds / 10, "{pauses} pauses, {retries} retries");
     assert!(agreed > seeds / 30 * 14, "only {agreed} of {seeds} jobs came to a consensus");
-    assert!(chose > seeds / 30 * 9, "only {chose} of {seeds} jobs chose their cameras anew");
     assert!(refined > seeds / 30 * 5, "only {refined} of {seeds} jobs refined their borders");
     assert!(succeeded > seeds / 30 * 29, "only {succeeded} of {seeds} jobs succeeded");
 }

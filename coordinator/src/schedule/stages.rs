@@ -20,23 +20,21 @@ pub enum Stage {
     Plan = 1,
     /// Trains the coarse model of the whole scene.
     Global = 2,
-    /// Selects the cameras of the partitions by their share of the coarse model.
-    Select = 3,
     /// Trains the part of a partition's run before the exchange.
-    FirstPart = 4,
+    FirstPart = 3,
     /// Collects the results that partitions exchange: one water for all, the Gaussians of their cells, or
     /// both.
-    Exchange = 5,
+    Exchange = 4,
     /// Trains one partition, or the rest of it after its first part.
-    Partition = 6,
+    Partition = 5,
     /// Merges the partitions into one model.
-    Merge = 7,
+    Merge = 6,
     /// Trains the merged model once more near the borders of cells.
-    Borders = 8,
+    Borders = 7,
     /// Computes the metrics on held-out views.
-    Evaluate = 9,
+    Evaluate = 8,
     /// Writes the files for the user.
-    Artifacts = 10,
+    Artifacts = 9,
 }
 
 /// Results that stages make for each other and for the user. The numbers are those of `Artifact` in
@@ -51,22 +49,20 @@ pub enum Artifact {
     PlanPicture = 2,
     /// The coarse model of the whole scene, PLY.
     CoarseModel = 3,
-    /// The share of each partition in each view.
-    Contributions = 4,
     /// The result of a partition's first part.
-    FirstPart = 5,
+    FirstPart = 4,
     /// The data that partitions exchange, JSON.
-    Exchange = 6,
+    Exchange = 5,
     /// The Gaussians of a partition, PLY.
-    PartitionModel = 7,
+    PartitionModel = 6,
     /// The model of the whole scene, PLY: as merged, later as the border stage changed it.
-    Model = 8,
+    Model = 7,
     /// The contribution of each partition to the merged model, JSON.
-    MergeReport = 9,
+    MergeReport = 8,
     /// The results of the evaluation.
-    Evaluation = 10,
+    Evaluation = 9,
     /// The index of the files for the user, JSON.
-    Index = 11,
+    Index = 10,
 }
 
 /// Where the tasks of a stage run.
@@ -100,7 +96,7 @@ pub struct StageSpec {
 }
 
 /// All stages, in order.
-pub const STAGES: [StageSpec; 10] = [
+pub const STAGES: [StageSpec; 9] = [
     StageSpec {
         stage: Stage::Plan,
         name: "plan",
@@ -117,16 +113,7 @@ pub const STAGES: [StageSpec; 10] = [
         per_partition: false,
         trains: true,
         inputs: &[],
-        outputs: &[Artifact::CoarseModel, Artifact::Contributions],
-    },
-    StageSpec {
-        stage: Stage::Select,
-        name: "select",
-        runs_on: RunsOn::Coordinator,
-        per_partition: false,
-        trains: false,
-        inputs: &[Artifact::Plan, Artifact::Contributions],
-        outputs: &[Artifact::Plan, Artifact::PlanPicture],
+        outputs: &[Artifact::CoarseModel],
     },
     StageSpec {
         stage: Stage::FirstPart,
@@ -296,7 +283,6 @@ impl Artifact {
             Self::Plan => "plan",
             Self::PlanPicture => "picture of the plan",
             Self::CoarseModel => "coarse model",
-            Self::Contributions => "contributions of the views",
             Self::FirstPart => "first part",
             Self::Exchange => "exchange",
             Self::PartitionModel => "model of the partition",

@@ -16,7 +16,6 @@ mod numbers;
 mod partitions;
 mod priors;
 mod seams;
-mod selection;
 mod water;
 mod weights;
 
@@ -33,7 +32,6 @@ pub use network::{NetworkConfig, NetworkStart};
 pub use partitions::WaterPartitions;
 pub use priors::{DarkChannelOn, PriorsConfig};
 pub use seams::SeamsConfig;
-pub use selection::CameraSelection;
 pub use water::{Blend, LossLight, Medium, WaterConfig, WaterPrior};
 pub use weights::{WeightMode, WeightTerms};
 
@@ -189,13 +187,6 @@ pub struct PartitionConfig {
     pub visibility: f64,
     /// Factor on `visibility` for edge partitions. Default 0.3 (SMP-UWGS eq. 3).
     pub visibility_edge_factor: f64,
-    /// Criterion that selects cameras: `visibility` or `contribution`. Default visibility
-    /// (bench/history.jsonl).
-    pub selection: CameraSelection,
-    /// Share of the picture that must show surfaces in the extended box for `contribution` to select a
-    /// camera. Default 0.05 (ours, above the 0.03 of its own pixels below which a partition leaves a view
-    /// out).
-    pub contribution: f64,
     /// Iterations of the global stage as a share of the job's. Default 0.25 (docs/decisions/0028).
     pub global_iterations: f64,
     /// Minimum iterations of the global stage, never more than those of the job. Default 1000 (ours). On fox
@@ -210,8 +201,8 @@ pub struct PartitionConfig {
     pub neighbours_from: f64,
     /// Iterations of every partition. Default 0. 0 gives each partition a share by its cameras.
     pub iterations_per_partition: u32,
-    /// Target of the depth-aware weight of a partition: `none`, `loss_factor`, `density_threshold`,
-    /// `iteration_budget` or `joint`. Default none (bench/history.jsonl).
+    /// Target of the depth-aware weight of a partition: `none`, `loss_factor` or `joint`. Default none
+    /// (docs/decisions/0014).
     pub weights: WeightMode,
     /// Terms of these weights.
     pub weight_terms: WeightTerms,
@@ -231,8 +222,6 @@ impl Default for PartitionConfig {
             extend_inner: 1.5,
             visibility: 0.25,
             visibility_edge_factor: 0.3,
-            selection: CameraSelection::Visibility,
-            contribution: 0.05,
             global_iterations: 0.25,
             global_least_iterations: 1000,
             global_gaussians: 0.25,
@@ -517,8 +506,7 @@ impl JobConfig {
             (0.0..=1.0).contains(&p.visibility_edge_factor),
             "partition.visibility_edge_factor must be between 0 and 1",
         );
-        require((0.0..=1.0).contains(&p.contribution), "partition.contribution must be between 0 and 1");
-        p.weight_terms.validate(p, &mut require);
+        p.weight_terms.validate(&mut require);
         require(
             p.global_iterations > 0.0 && p.global_iterations <= 1.0,
             "partition.global_iterations must be above 0 and at most 1",

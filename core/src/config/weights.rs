@@ -2,8 +2,6 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::PartitionConfig;
-
 /// The target of the weight of a partition. The totals of the job (iterations, cap) are the same in every
 /// mode. In a job of one partition, weights have no effect.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -15,14 +13,8 @@ pub enum WeightMode {
     /// The weight multiplies the whole loss of a partition's run, as printed. Under Adam this has almost no
     /// effect: a step is a mean gradient over the root of a mean square. Two effects remain. Density control
     /// by `classic` changes, since its gradient threshold is not multiplied. So does the influence of
-    /// partitions that refine the water on the consensus.
+    /// partitions that train the water jointly on the consensus.
     LossFactor,
-    /// Where Gaussians are added. With `mcmc`, the cap of a partition is proportional to its share of the
-    /// points times its weight. With `classic`, the gradient from which Gaussians are added is divided by the
-    /// weight.
-    DensityThreshold,
-    /// The iterations of a partition are proportional to its number of cameras times its weight.
-    IterationBudget,
     /// The global stage sees a view in proportion to the weight of the view's own partition. On average this
     /// minimises the weighted sum of the paper. A factor on the loss of each view would affect only what
     /// views of several partitions see.
@@ -48,7 +40,7 @@ pub struct WeightTerms {
     pub gamma_inner: f64,
     /// Largest weight. Default 1 (SMP-UWGS section 3.1). Where cameras see boxes that fill half of their
     /// pictures, all partitions except inner ones reach it and have equal weights. Only ratios of weights
-    /// matter, except with `loss_factor` and with the threshold of `classic`, which use the weight itself.
+    /// matter, except with `loss_factor`, which uses the weight itself.
     pub clamp: f64,
 }
 
@@ -68,7 +60,7 @@ impl Default for WeightTerms {
 
 impl WeightTerms {
     /// Reports every invalid value to `require`, by name.
-    pub(super) fn validate(&self, partition: &PartitionConfig, require: &mut impl FnMut(bool, &str)) {
+    pub(super) fn validate(&self, require: &mut impl FnMut(bool, &str)) {
         for (name, value) in [("tau_init", self.tau_init), ("depth_factor", self.depth_factor)] {
             let fault = format!("partition.weight_terms.{name} must be a finite number, 0 or more");
             require(value >= 0.0 && value.is_finite(), &fault);
@@ -84,17 +76,12 @@ impl WeightTerms {
             let fault = format!("partition.weight_terms.{name} must be a finite number above 0");
             require(value > 0.0 && value.is_finite(), &fault);
         }
-        require(
-            partition.weights != WeightMode::IterationBudget || partition.iterations_per_partition == 0,
-            "partition.weights = \"iteration_budget\" distributes iterations by weight, but \
-             partition.iterations_per_partition fixes them; use only one of them",
-        );
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::JobConfig;
+    use super::super::{JobConfig, PartitionConfig};
     use super::*;
 
     fn refusals(change: impl Fn(&mut PartitionConfig)) -> String {
@@ -108,8 +95,6 @@ mod tests {
         for (mode, name) in [
             (WeightMode::None, "\"none\""),
             (WeightMode::LossFactor, "\"loss_factor\""),
-            (WeightMode::DensityThreshold, "\"density_threshold\""),
-            (WeightMode::IterationBudget, "\"iteration_budget\""),
             (WeightMode::Joint, "\"joint\""),
         ] {
             assert_eq!(serde_json::to_string(&mode).ok().as_deref(), Some(name));
@@ -127,12 +112,5 @@ mod tests {
             assert!(told.contains(name), "{name} is missing in {told}");
         }
         assert!(!told.contains("gamma_corner"), "{told}");
-    }
-
-    #[test]
-    fn iterations_are_fixed_or_shared_out_by_weight_but_not_both() {
-        let both = |mode| refusals(move |p| (p.weights, p.iterations_per_partition) = (mode, 500));
-        assert!(both(WeightMode::IterationBudget).contains("partition.iterations_per_partition"));
-        assert_eq!(both(WeightMode::DensityThreshold), "");
     }
 }

@@ -8,7 +8,7 @@ use fathom_core::ply;
 use fathom_core::scene::{BlobRef, Points};
 use fathom_core::water::{StandardErrors, Water, WaterRecord};
 use fathom_proto::worker::v1::task_spec::Work;
-use fathom_proto::worker::v1::{Artifact, Contributions, FailClass, GlobalSpec, Refined};
+use fathom_proto::worker::v1::{Artifact, FailClass, Refined};
 use fathom_worker::blobs::to_proto;
 use fathom_worker::execute::{TaskError, TaskInput};
 use glam::{DQuat, DVec3};
@@ -80,18 +80,6 @@ pub fn refined(task: &TaskInput, state: &BlobRef) -> Bytes {
         rows: None,
     };
     refined.encode_to_vec().into()
-}
-
-/// The contribution of views to each partition, if requested.
-pub fn contributions(task: &TaskInput) -> Option<Bytes> {
-    let Work::Global(GlobalSpec { regions, .. }) = &task.work else { return None };
-    let (views, partitions) = (task.common.views.clone(), regions.len());
-    let share = |view: u32, partition: usize| {
-        if (view as usize + partition).is_multiple_of(2) { 0.5 } else { 0.0 }
-    };
-    let shares = views.iter().flat_map(|&view| (0..partitions).map(move |k| share(view, k))).collect();
-    let said = Contributions { format: 1, views, partitions: partitions as u32, shares };
-    (partitions > 0).then(|| said.encode_to_vec().into())
 }
 
 /// Result of border training: the merged model with other opacities in the band.

@@ -1,6 +1,6 @@
 //! The scene of all jobs: flat, small, fast to plan and merge.
 
-use fathom_core::config::{CameraSelection, JobConfig, WaterPartitions};
+use fathom_core::config::{JobConfig, WaterPartitions};
 use fathom_core::picture::encode_png;
 use fathom_core::scene::{BlobRef, Camera, CameraModel, Manifest, ManifestView, Points, Pose};
 use glam::DVec3;
@@ -79,10 +79,7 @@ pub fn config(partitions: u32, variety: Variety) -> JobConfig {
     config.train.iterations = 120;
     match variety {
         Variety::Plain => {}
-        Variety::Water => {
-            config.partition.selection = CameraSelection::Contribution;
-            config.water.partitions = WaterPartitions::Joint;
-        }
+        Variety::Water => config.water.partitions = WaterPartitions::Joint,
         Variety::Borders => config.borders.enabled = true,
     }
     config

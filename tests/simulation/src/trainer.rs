@@ -93,11 +93,7 @@ impl Trainer {
         if task.stage == Stage::Borders {
             return Ok(output(results::with_borders(task, &state)?, resumed_from));
         }
-        let mut output = output(results::model(task, &state)?, resumed_from);
-        if let Some(shares) = results::contributions(task) {
-            output.further.push((Artifact::Contributions, control.uploading(shares).await?));
-        }
-        Ok(output)
+        Ok(output(results::model(task, &state)?, resumed_from))
     }
 
     async fn evaluate(&self, task: &TaskInput, control: &dyn Control) -> Result<TaskOutput, TaskError> {

@@ -1,36 +1,25 @@
 //! GLOBAL: trains the coarse model of the whole scene from its sparse points, and the water shared by all
-//! partitions. If partitions select cameras by contribution, it also measures how much each view shows of
-//! each partition.
+//! partitions.
 
 use std::sync::Arc;
 
 use fathom_core::gpu::Gpu;
-use fathom_core::ply;
 use fathom_core::train::MediumRun;
 use fathom_core::views::ViewSource;
-use fathom_proto::worker::v1::{Artifact, GlobalSpec};
 
-use super::contribution;
 use super::training::{Span, parts_of_points, train};
 use super::{Control, TaskError, TaskInput, TaskOutput};
 
 pub fn run(
     gpu: &Arc<Gpu>,
     task: &TaskInput,
-    spec: &GlobalSpec,
     views: Arc<dyn ViewSource>,
     control: &dyn Control,
 ) -> Result<TaskOutput, TaskError> {
     let (mut parts, views) = parts_of_points(task, views)?;
     parts.medium = parts.medium.map(of_coarse_run);
     let span = Span::of(&task.common);
-    let mut output = train(gpu, task, task.train_config(), Arc::clone(&views), parts, span, control)?;
-    if !spec.regions.is_empty() {
-        let model = ply::from_bytes(&output.result, "the coarse model")?;
-        let contributions = contribution::submit(gpu, task, &spec.regions, &model, views.as_ref(), control)?;
-        output.further.push((Artifact::Contributions, contributions));
-    }
-    Ok(output)
+    train(gpu, task, task.train_config(), views, parts, span, control)
 }
 
 /// The medium of the coarse run. Its view-dependent colours learn no faster than its constant colours;

@@ -1,7 +1,6 @@
 //! Executes a task without network access: all inputs are files, and all reports go out through [`Control`].
 
 mod borders;
-mod contribution;
 mod evaluate;
 mod first_part;
 mod global;
@@ -100,10 +99,7 @@ impl TaskInput {
     fn train_config(&self) -> TrainConfig {
         let CommonSpec { iterations, max_gaussians, .. } = self.common;
         let mut config = TrainConfig { iterations, max_gaussians, ..self.config.train.clone() };
-        let factors = self.partition().map(|spec| (spec.loss_factor, spec.gradient_factor));
-        let (loss_factor, gradient_factor) = factors.unwrap_or_default();
-        config.loss_factor = loss_factor.unwrap_or(1.0);
-        config.classic.gradient *= gradient_factor.unwrap_or(1.0);
+        config.loss_factor = self.partition().and_then(|spec| spec.loss_factor).unwrap_or(1.0);
         config
     }
 
@@ -146,7 +142,7 @@ impl TaskInput {
         }
         let views = self.views_of(views, clear_ranges, *max_resolution_px, limit_bytes)?;
         Ok(match &self.work {
-            Work::Global(GlobalSpec { view_weights, .. }) if !view_weights.is_empty() => {
+            Work::Global(GlobalSpec { view_weights }) if !view_weights.is_empty() => {
                 Arc::new(Weighted::new(views, view_weights.clone())?)
             }
             _ => views,
@@ -372,7 +368,7 @@ impl CoreExecutor {
     fn run(&self, gpu: &Arc<Gpu>, task: &TaskInput, control: &dyn Control) -> Result<TaskOutput, TaskError> {
         let views = task.views(self.image_cache_bytes)?;
         match &task.work {
-            Work::Global(spec) => global::run(gpu, task, spec, views, control),
+            Work::Global(_) => global::run(gpu, task, views, control),
             Work::FirstPart(spec) => first_part::run(gpu, task, spec, views, control),
             Work::Partition(spec) => partition::run(gpu, task, spec, views, control),
             Work::Borders(spec) => borders::run(gpu, task, spec, views, control),

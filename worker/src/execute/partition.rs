@@ -129,20 +129,7 @@ impl<'a> Inside<'a> {
     }
 
     pub(super) fn contains(&self, point: DVec3) -> bool {
-        self.contains_aligned(self.aligned(point))
-    }
-
-    /// Rotation from world axes to box axes.
-    pub(super) fn rotation(&self) -> DQuat {
-        self.rotation
-    }
-
-    /// A world point in the frame of the box.
-    pub(super) fn aligned(&self, point: DVec3) -> DVec3 {
-        self.rotation * point
-    }
-
-    pub(super) fn contains_aligned(&self, aligned: DVec3) -> bool {
+        let aligned = self.rotation * point;
         let FocusBox { min_x, max_x, min_z, max_z, .. } = self.bounds;
         aligned.is_finite()
             && aligned.x > *min_x

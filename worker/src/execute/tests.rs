@@ -532,11 +532,10 @@ fn a_task_follows_the_factors_and_view_weights_of_its_spec() {
     assert_eq!(plain.loss_factor, 1.0);
     assert!(task.views(0).unwrap().weights().is_none());
     let spec = task.partition_mut();
-    (spec.loss_factor, spec.gradient_factor) = (Some(0.25), Some(3.0));
+    spec.loss_factor = Some(0.25);
     let weighed = task.train_config();
     assert_eq!(weighed.loss_factor, 0.25);
-    assert_eq!(weighed.classic.gradient, 3.0 * plain.classic.gradient);
-    let weighted = |view_weights: Vec<f32>| Work::Global(GlobalSpec { view_weights, regions: Vec::new() });
+    let weighted = |view_weights: Vec<f32>| Work::Global(GlobalSpec { view_weights });
     task.work = weighted(vec![0.5, 2.0, 1.0]);
     assert_eq!(task.views(0).unwrap().weights(), Some(&[0.5, 2.0, 1.0][..]));
     task.work = weighted(vec![0.5]);

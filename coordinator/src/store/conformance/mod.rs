@@ -66,10 +66,6 @@ fn planned(partitions: usize) -> TaskOutput {
 }
 
 fn planned_as(partitions: usize, refines: bool) -> TaskOutput {
-    planned_with(partitions, refines, false)
-}
-
-fn planned_with(partitions: usize, refines: bool, select: bool) -> TaskOutput {
     let task = |name: String| PlannedTask::new(blob(&name), 100);
     let own = |stage: Stage| (stage.task(), PlannedTask::default());
     let mut tasks = BTreeMap::from([own(Stage::Merge), own(Stage::Artifacts)]);
@@ -77,7 +73,6 @@ fn planned_with(partitions: usize, refines: bool, select: bool) -> TaskOutput {
     if partitions > 1 {
         tasks.insert(Stage::Global.task(), task("global".into()));
     }
-    tasks.extend(select.then(|| own(Stage::Select)));
     tasks.extend(refines.then(|| own(Stage::Exchange)));
     for index in 0..partitions {
         if refines {
@@ -115,18 +110,6 @@ fn every_stage() -> Vec<Stage> {
 
 fn merged() -> TaskOutput {
     TaskOutput::merged(blob("model"), blob("report"), TaskStats::default())
-}
-
-/// The selection of cameras of a job of two partitions with first parts.
-fn chosen() -> TaskOutput {
-    let task = |name: String| PlannedTask::new(blob(&name), 30);
-    let mut tasks = BTreeMap::new();
-    for index in 0..2 {
-        tasks.insert(Stage::FirstPart.task_of(index), task(format!("final first of {index}")));
-        tasks.insert(Stage::Partition.task_of(index), task(format!("final {index}")));
-    }
-    let planned = Planned { tasks, warnings: vec!["few cameras".into()] };
-    TaskOutput::planned(blob("final plan"), blob("final picture"), planned)
 }
 
 fn is_stale<T: std::fmt::Debug>(result: Result<T, StoreError>) -> bool {
@@ -438,7 +421,6 @@ conformance!(
     partitions_resume_their_first_part_under_one_consensus,
     borders_are_refined_before_evaluation_and_become_the_model,
     a_phase_that_fails_for_good_ends_the_job,
-    everything_after_the_coarse_model_uses_selected_cameras,
     a_paused_job_gives_nothing_out_and_takes_what_comes_in,
     the_time_of_a_stage_is_without_pauses,
     a_failed_job_goes_on_where_it_failed,

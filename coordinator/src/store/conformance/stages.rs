@@ -68,59 +68,6 @@ pub async fn partitions_resume_their_first_part_under_one_consensus(store: Arc<d
     assert_eq!(entered, [Stage::Global, Stage::FirstPart, Stage::Exchange, Stage::Partition, Stage::Merge]);
 }
 
-pub async fn everything_after_the_coarse_model_uses_selected_cameras(store: Arc<dyn Store>) {
-    let store = store.as_ref();
-    let id = job_of(store, 1, planned_with(2, true, true)).await;
-    do_next(store, Stage::Global.task(), T0 + 20).await;
-    assert!(
-        claim(store, &Stage::of_workers(), T0 + 30).await.is_none(),
-        "a partition began without its cameras"
-    );
-
-    // The coordinator crashes before it submits the selection: the next process makes it again.
-    let dead = claim(store, &Stage::own(), T0 + 30).await.unwrap().lease;
-    store.recover(T0 + 40).await.unwrap();
-    assert!(is_stale(store.complete(&dead, chosen(), T0 + 50).await));
-    assert_eq!(
-        store.job(&id).await.unwrap().job.output(Artifact::Plan),
-        Some(&blob("plan")),
-        "a dead process changed the plan"
-    );
-    let grant = claim(store, &Stage::own(), T0 + 60).await.unwrap();
-    assert_eq!((grant.lease.task, grant.lease.attempt, grant.task.losses), (Stage::Select.task(), 2, 0));
-    let refused = store.complete(&grant.lease, result_as(Stage::Select, "a plan"), T0 + 60).await;
-    assert!(
-        matches!(refused, Err(StoreError::Refused(Refusal::WrongOutput(task))) if task.stage == Stage::Select),
-        "{refused:?}"
-    );
-    store.complete(&grant.lease, chosen(), T0 + 60).await.unwrap();
-    let again = store.complete(&grant.lease, chosen(), T0 + 70).await.unwrap();
-    assert_eq!(again, Outcome::Already);
-
-    let view = store.job(&id).await.unwrap();
-    assert_eq!(
-        (view.job.output(Artifact::Plan), view.job.output(Artifact::PlanPicture)),
-        (Some(&blob("final plan")), Some(&blob("final picture")))
-    );
-    assert_eq!(view.job.iterations_total, 100 + 4 * 30);
-    for index in 0..2 {
-        let grant = do_next(store, Stage::FirstPart.task_of(index), T0 + 80).await;
-        assert_eq!(grant.task.spec, Some(blob(&format!("final first of {index}"))));
-    }
-    do_next(store, Stage::Exchange.task(), T0 + 90).await;
-    for index in 0..2 {
-        let grant = do_next(store, Stage::Partition.task_of(index), T0 + 100).await;
-        assert_eq!((grant.task.spec, grant.task.iterations), (Some(blob(&format!("final {index}"))), 30));
-    }
-    let view = store.job(&id).await.unwrap();
-    assert_eq!((view.job.stage, view.job.iterations_done), (Stage::Merge, 220));
-    let events = store.events(&id, 0, 1000).await.unwrap().into_iter().filter_map(|event| match event.body {
-        EventBody::Warning { message } => Some(message),
-        _ => None,
-    });
-    assert_eq!(events.collect::<Vec<_>>(), ["a warning", "few cameras"]);
-}
-
 pub async fn borders_are_refined_before_evaluation_and_become_the_model(store: Arc<dyn Store>) {
     let store = store.as_ref();
     let borders = PlannedTask::new(blob("borders"), 30);
