@@ -100,7 +100,7 @@ impl Consensus {
     /// Checks the format and the parameters; the error says why they cannot be used.
     pub(crate) fn check(&self) -> std::result::Result<(), String> {
         if self.format != FORMAT {
-            return Err(format!("its format is {}; this program reads {FORMAT}", self.format));
+            return Err(format!("it has format {}; this program reads {FORMAT}", self.format));
         }
         let water = self.water.water();
         if water.is_physical() {
