@@ -142,7 +142,7 @@ mod tests {
     }
 
     #[test]
-    fn what_only_a_network_needs_is_not_asked_of_others() {
+    fn rules_for_a_network_do_not_apply_to_other_priors() {
         let sparse = |config: &mut JobConfig| {
             config.water.prior = WaterPrior::Sparse;
             config.water.network.every = 0;
