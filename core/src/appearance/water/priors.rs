@@ -1,5 +1,5 @@
 //! Priors of an underwater run on the device (SMP-UWGS eq. 12 to 14): the dark channel of the direct signal,
-//! and depth that is smooth except at edges of the photograph.
+//! and smooth depth except at edges of the photograph.
 //!
 //! They have no forward pass, since only their gradients are needed. The dark channel adds its gradient of
 //! the picture before the backward pass of the water, whatever the water is. Direct gradients of alpha, range
