@@ -130,7 +130,7 @@ mod tests {
     }
 
     #[test]
-    fn values_that_cannot_be_are_named() {
+    fn invalid_values_are_refused_by_name() {
         let borders = BordersConfig {
             enabled: true,
             width: 0.0,

@@ -73,7 +73,7 @@ mod tests {
     }
 
     #[test]
-    fn values_that_cannot_be_are_named() {
+    fn invalid_values_are_refused_by_name() {
         let mut config = JobConfig::default();
         config.water.film = FilmConfig {
             cell: 4,

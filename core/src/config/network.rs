@@ -116,7 +116,7 @@ mod tests {
     }
 
     #[test]
-    fn values_that_cannot_be_are_refused_by_name() {
+    fn invalid_values_are_refused_by_name() {
         assert_eq!(faults(|_| ()), "");
         let network = |change: fn(&mut NetworkConfig)| faults(|config| change(&mut config.water.network));
         for (error, name) in [

@@ -157,7 +157,9 @@ impl RangeImage<'_> {
             )));
         }
         if !(unit > 0.0 && unit.is_finite()) {
-            return Err(CoreError::Network(format!("the scene scale is {unit}, which is no length")));
+            return Err(CoreError::Network(format!(
+                "the scene scale is {unit}; it must be finite and above 0"
+            )));
         }
         Ok(())
     }
@@ -374,7 +376,7 @@ mod tests {
         let image = RangeImage { width: 4, height: 4, ranges: &[0.0; 16], alphas: &[0.0; 15] };
         assert!(refused(DepthMap::from_render(&image, 16, 16, 1.0)).contains("15 alphas"));
         let image = RangeImage { width: 4, height: 4, ranges: &[0.0; 16], alphas: &[0.0; 16] };
-        assert!(refused(DepthMap::from_render(&image, 16, 16, 0.0)).contains("no length"));
+        assert!(refused(DepthMap::from_render(&image, 16, 16, 0.0)).contains("finite and above 0"));
         assert_eq!(DepthMap::from_render(&image, 16, 16, 1.0).unwrap().coverage(), 0.0);
     }
 }

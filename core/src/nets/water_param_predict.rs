@@ -12,7 +12,7 @@
 //!
 //! C is 64 in the release (`dpr_net/water_param_predictor.py`); a narrower network has the same structure and
 //! costs less. Initial values are those of the release: Kaiming by fan-out for convolutions, Xavier with gain
-//! 0.35 for the first FC, and N(0, 0.05^2) for the last, whose bias is the prior. Differences:
+//! 0.35 for the first FC. The last FC has N(0, 0.05^2), and the prior as bias. Differences:
 //!
 //! - Group normalisation in place of batch normalisation, which fails with a batch of one (`GroupNorm`).
 //! - No dropout (0.3 between the FCs in the release). With a batch of one it would add noise to the single

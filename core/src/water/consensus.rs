@@ -23,7 +23,8 @@ const FORMAT: u32 = 1;
 const FAR_OFF: f64 = 5.0;
 /// Minimum number of partitions with evidence for outlier detection: of three, two may be outliers.
 const LEAST_TO_JUDGE: usize = 4;
-/// Minimum standard deviation of an unconstrained parameter: smaller differences never count as outliers.
+/// Minimum standard deviation of an unconstrained parameter, so that tiny differences never count as
+/// outliers.
 const LEAST_SPREAD: f64 = 1e-3;
 /// Ratio of the standard deviation to the median absolute deviation (normal distribution).
 const OF_MEDIAN_DEVIATION: f64 = 1.4826;

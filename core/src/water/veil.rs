@@ -142,7 +142,8 @@ impl Darkness<'_> {
             }
         };
         let brightest = self.dark.iter().map(|cell| cell.dark[c]).fold(0.01, f64::max);
-        // Without open water, the limit is at most the median colour far away.
+        // Without open water, the limit is at most the median colour far away, or the largest dark value if
+        // that is larger.
         let far = self.far(c).max(brightest).min(1.0).ln();
         let limit = if self.open.is_some() { 0.0 } else { far };
         let bounds = [
@@ -191,7 +192,7 @@ impl Darkness<'_> {
         (spread > 0.0).then(|| [slope(0), slope(2)])
     }
 
-    /// A low quantile of the dark values of near cells.
+    /// The 20 % quantile of the dark values of the nearest cells.
     fn nearest(&self, c: usize) -> Option<f64> {
         let mut ranges: Vec<f64> = self.dark.iter().map(|cell| cell.range).collect();
         ranges.sort_by(f64::total_cmp);

@@ -68,7 +68,7 @@ pub struct WaterStep {
     pub level: u32,
     /// Columns and rows of the view's ray map; 0 without one.
     pub map: [u32; 2],
-    /// Distance in sRGB from the colour of open water from which a pixel at its edge shows a surface.
+    /// Distance in sRGB from the colour of open water beyond which a pixel at its edge shows a surface.
     pub alike: f32,
 }
 

@@ -1,5 +1,5 @@
-//! The water of a run and the settings that depend on it: the rates of its parameters, the maximum width of
-//! Gaussians, and the loss terms that are off in clear water.
+//! The water of a run and the settings that depend on it: parameter rates, the maximum width of Gaussians,
+//! and the loss terms that are off in clear water.
 
 use crate::config::{Composition, DbdrMode, WaterConfig};
 use crate::water::{ByDirection, RangeModulation, Water, WaterRecord};
