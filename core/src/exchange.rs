@@ -1,4 +1,4 @@
-//! What the partitions of a job give one another between the first and the second part of their runs.
+//! Data that the partitions of a job exchange between the first and the second part of their runs.
 
 use std::collections::BTreeMap;
 
@@ -11,35 +11,35 @@ use crate::{CoreError, Result};
 /// Version of [`Exchange`]'s layout.
 const FORMAT: u32 = 1;
 
-/// What second parts go on with.
+/// The input of the second parts.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Exchange {
     /// Version of this layout: 1.
     pub format: u32,
-    /// The water of the rest of the job; `None` where partitions do not refine it.
+    /// The water for the rest of the job; `None` if partitions do not refine it.
     pub water: Option<Consensus>,
     /// By partition, the Gaussians of its own cell at the end of its first part (PLY, world axes, scene
-    /// units); none of one that had nothing to train, and empty where partitions do not end beside their
-    /// neighbours.
+    /// units). A partition without anything to train has no entry. Empty if partitions do not use the
+    /// Gaussians of their neighbours.
     pub rows: BTreeMap<u32, BlobRef>,
 }
 
 impl Exchange {
-    /// Of these two.
+    /// An exchange of the current format.
     pub fn new(water: Option<Consensus>, rows: BTreeMap<u32, BlobRef>) -> Self {
         Self { format: FORMAT, water, rows }
     }
 
-    /// Reads what was written as JSON.
+    /// Reads an exchange from JSON.
     ///
     /// # Errors
-    /// When it is none that this program can read.
+    /// When the JSON is malformed or has an unsupported format.
     pub fn from_json(json: &[u8]) -> Result<Self> {
         let refuse = |why: String| CoreError::Scene(format!("the exchange of the partitions: {why}"));
         let read: Self = serde_json::from_slice(json).map_err(|error| refuse(error.to_string()))?;
         if read.format != FORMAT {
-            return Err(refuse(format!("it has format {}, and this program reads {FORMAT}", read.format)));
+            return Err(refuse(format!("it has format {}; this program reads {FORMAT}", read.format)));
         }
         read.water.as_ref().map_or(Ok(()), Consensus::check).map_err(refuse)?;
         Ok(read)
@@ -51,7 +51,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_written_is_read_and_what_is_not_understood_is_refused() {
+    fn exchange_survives_json_and_unknown_content_is_refused() {
         let rows = BTreeMap::from([(3, BlobRef { digest: "ab".repeat(32), bytes: 7 })]);
         let exchange = Exchange::new(None, rows);
         let json = serde_json::to_string(&exchange).unwrap();

@@ -1,7 +1,7 @@
-//! Floaters: Gaussians that hang in the water before the scene, where no surface is.
+//! Floaters: Gaussians in the water in front of the scene, away from any surface.
 //!
-//! The loss cannot tell veil from a haze of Gaussians before the camera; sparse points can, since they lie on
-//! surfaces.
+//! The loss cannot distinguish a veil from a haze of Gaussians in front of the camera. Sparse points can,
+//! since they lie on surfaces.
 
 use std::collections::HashMap;
 
@@ -11,29 +11,30 @@ use rayon::prelude::*;
 use crate::gaussians::Gaussians;
 use crate::scene::{PinholeCamera, Points, Pose};
 
-/// Sparse points that a view needs, so that their 2nd percentile says where its scene begins.
+/// Minimum number of sparse points of a view, so that their 2nd percentile shows where its scene begins.
 const LEAST_POINTS: usize = 20;
-/// Percentile of a view's sparse ranges from which its scene begins.
+/// Quantile of a view's sparse ranges at which its scene begins.
 const BEGINS: f64 = 0.02;
-/// Up to this share of it a view is clear.
+/// Share of that range up to which a view is clear.
 const NEAR: f32 = 0.5;
 
-/// What [`floaters`] counts. Both numbers weigh a Gaussian by its opacity.
+/// The result of [`floaters`]. Both numbers weight a Gaussian by its opacity.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Floaters {
-    /// Floaters.
+    /// Number of floaters.
     pub count: f64,
     /// Floaters as a share of all Gaussians.
     pub share: f64,
-    /// Views that had enough sparse points to say where their scene begins.
+    /// Number of views with enough sparse points to know where their scene begins.
     pub views: usize,
 }
 
-/// How far each view is clear: half of the 2nd percentile of the ranges of its sparse points, scene units.
-/// Nothing of the scene is nearer. 0 for a view with fewer than 20 points, of which nobody can tell.
+/// The range up to which each view is clear: half of the 2nd percentile of the ranges of its sparse points,
+/// scene units. No part of the scene is nearer. 0 for a view with fewer than 20 points, where it is unknown.
 ///
-/// `views` are (index in the scene by name, camera, world to camera), no index twice. A view's points are
-/// those whose track names it; of points without tracks, all that project into its picture, thinned out
+/// `views` are (index in the scene by name, camera, world to camera), each index once. The points of a view
+/// are those whose track contains it. Without tracks, they are all points that project into its picture,
+/// thinned evenly to at most 32,768.
 /// evenly to at most 32,768.
 pub fn clear_ranges(views: &[(u32, PinholeCamera, Pose)], points: &Points) -> Vec<f32> {
     const UNTRACKED: usize = 32_768;
@@ -65,8 +66,8 @@ fn clear_range(mut ranges: Vec<f32>) -> f32 {
     NEAR * *ranges.select_nth_unstable_by(at, f32::total_cmp).1
 }
 
-/// Counts the Gaussians of `model` whose centre lies, in some view's picture, where that view is clear
-/// ([`clear_ranges`]), weighted by their opacity. `None` where nobody can tell of any view.
+/// Counts the Gaussians of `model` whose centre is in the clear range of any view ([`clear_ranges`]),
+/// weighted by their opacity. `None` if no view has a clear range.
 pub fn floaters(
     model: &Gaussians,
     views: &[(u32, PinholeCamera, Pose)],
@@ -97,7 +98,7 @@ pub fn floaters(
     Some(Floaters { count, share: if all > 0.0 { count / all } else { 0.0 }, views: near.len() })
 }
 
-/// Distance of a point from the camera where it projects into the picture.
+/// Distance of a point from the camera; `None` outside the picture.
 fn range_in(camera: &PinholeCamera, pose: &Pose, point: DVec3) -> Option<f32> {
     let p = pose.transform(point);
     let (x, y) = (camera.fx * p.x / p.z + camera.cx, camera.fy * p.y / p.z + camera.cy);
@@ -111,7 +112,7 @@ fn range_in(camera: &PinholeCamera, pose: &Pose, point: DVec3) -> Option<f32> {
 mod tests {
     use super::*;
 
-    /// A camera at the origin that looks along z, and points on a wall 10 away of which one lies at 1.
+    /// A camera at the origin looking along z, and points on a wall 10 away, plus one at 1.
     fn scene() -> (Vec<(u32, PinholeCamera, Pose)>, Points) {
         let camera = PinholeCamera { width: 100, height: 100, fx: 100.0, fy: 100.0, cx: 50.0, cy: 50.0 };
         let pose = Pose::from_wxyz([1.0, 0.0, 0.0, 0.0], [0.0; 3]);
@@ -136,7 +137,7 @@ mod tests {
     }
 
     #[test]
-    fn a_view_is_clear_up_to_half_of_where_its_points_begin() {
+    fn view_is_clear_up_to_half_of_its_nearest_ranges() {
         let (views, points) = scene();
         let [clear] = clear_ranges(&views, &points)[..] else { panic!("one view") };
         assert!((5.0..5.01).contains(&clear), "{clear}");
@@ -146,10 +147,10 @@ mod tests {
     }
 
     #[test]
-    fn what_hangs_before_the_scene_counts_by_its_opacity() {
+    fn floaters_are_weighted_by_opacity() {
         let (views, points) = scene();
         let at = |z: f32| [0.0, 0.0, z];
-        // On the wall, just behind half way, just before it, out of the picture, behind the camera.
+        // On the wall, just beyond the clear range, just within it, outside the picture, behind the camera.
         let model = model(&[at(10.0), at(5.1), at(4.9), [4.0, 0.0, 4.0], at(-1.0)], 0.0);
         let found = floaters(&model, &views, &points).expect("enough points");
         assert!((found.count - 0.5).abs() < 1e-9, "{found:?}");
@@ -157,7 +158,7 @@ mod tests {
     }
 
     #[test]
-    fn one_wrong_point_before_the_scene_does_not_hide_floaters_and_few_points_say_nothing() {
+    fn floaters_are_found_despite_a_wrong_point() {
         let (views, points) = scene();
         let model = model(&[[0.0, 0.0, 2.0]], 9.0);
         assert!(floaters(&model, &views, &points).expect("enough points").count > 0.99);
@@ -166,7 +167,7 @@ mod tests {
     }
 
     #[test]
-    fn a_point_counts_in_the_views_of_its_track_only() {
+    fn point_counts_only_in_the_views_of_its_track() {
         let (mut views, untracked) = scene();
         let mut points = Points::default();
         for position in &untracked.positions {

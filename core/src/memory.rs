@@ -1,13 +1,12 @@
-//! GPU memory of a run, told before it begins: how long its lists should be, and what it will take at its
-//! largest.
+//! Forecasts the GPU memory of a run before it begins: the lengths of its lists, and its peak.
 //!
-//! A coordinator forecasts with it, without a GPU; the trainer makes its lists as long as [`RunSize::lists`]
-//! says, so that they seldom grow and the forecast holds. `core/tests/forecast.rs` compares the sizes below
-//! with the buffers of real runs, and the forecast with their peak.
+//! A coordinator uses it for forecasts, without a GPU. The trainer allocates its lists with the lengths from
+//! [`RunSize::lists`], so that they seldom grow and the forecast holds. `core/tests/forecast.rs` compares the
+//! sizes below with the buffers of real runs, and the forecast with their peak.
 //!
-//! What cannot be known before is estimated: how many Gaussians the fullest view sees, from where the points
-//! are ([`visible_in_fullest_view`]), and how many tiles they touch, by a formula fitted to measured runs
-//! ([`RunSize::lists`]).
+//! Two quantities are estimated. The number of Gaussians in the fullest view follows from the positions of
+//! the points ([`visible_in_fullest_view`]). The number of tiles that they touch follows from a formula
+//! fitted to measured runs ([`RunSize::lists`]).
 
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
@@ -16,94 +15,92 @@ use crate::appearance::{self, Settings};
 use crate::config::{Moments, TrainConfig};
 use crate::scene::{PinholeCamera, Pose};
 
-/// Bytes of a Gaussian's mean, quaternion, log scale and opacity: three vec4.
+/// Bytes per Gaussian for mean, quaternion, log scale and opacity: three vec4.
 pub const TRANSFORM_BYTES: u64 = 48;
-/// Bytes of what every Gaussian has in the lists of a view, seen or not: its flag.
+/// Bytes per Gaussian in the lists of a view, visible or not: its flag.
 pub const FLAG_BYTES: u64 = 4;
-/// Bytes a trained Gaussian takes for the statistics of density control and its steps: a vec4.
+/// Bytes per trained Gaussian for the statistics of density control and its steps: a vec4.
 pub const STATISTICS_BYTES: u64 = 16;
-/// Bytes a visible Gaussian takes: its splat (three vec4), index, segment (two words) and offset; key and
-/// value of the depth sort, twice.
+/// Bytes per visible Gaussian: its splat (three vec4), index, segment (two words) and offset; key and value
+/// of the depth sort, twice.
 pub const VISIBLE_BYTES: u64 = 80;
-/// Bytes an intersection takes: its Gaussian; key and value of the tile sort, twice; its gradient (three
-/// vec4).
+/// Bytes per intersection: its Gaussian; key and value of the tile sort, twice; its gradient (three vec4).
 pub const INTERSECTION_BYTES: u64 = 68;
-/// Bytes of an intersection's gradient, which rendering alone does not need.
+/// Bytes per intersection for its gradient, which rendering alone does not need.
 pub const GRADIENT_BYTES: u64 = 48;
-/// Bytes a trained Gaussian takes for its sums where views are rendered in bands: three vec4.
+/// Bytes per trained Gaussian for its sums if views are rendered in bands: three vec4.
 pub const BAND_BYTES: u64 = 48;
-/// Bytes a pixel of the render takes: colour and alpha (vec4) and range.
+/// Bytes per pixel of the render: colour and alpha (vec4) and range.
 pub const RENDER_BYTES: u64 = 20;
-/// Bytes a pixel of the loss takes: photograph, three maps of SSIM (vec4), gradients by colour (vec4) and by
-/// range.
+/// Bytes per pixel of the loss: photograph, three SSIM maps (vec4), gradients of colour (vec4) and of range.
 pub const LOSS_BYTES: u64 = 72;
-/// Bytes a pixel of a photograph takes.
+/// Bytes per pixel of a photograph.
 pub const PHOTOGRAPH_BYTES: u64 = 4;
 
-/// Bytes of photographs that stay on the device: 64 at 1080p.
+/// Maximum bytes of photographs kept on the device: 64 at 1080p.
 pub const RESIDENT_BYTES: u64 = 512 << 20;
-/// Content of writes that may wait in staging buffers until the device has copied it, bytes; a larger write
-/// waits alone. Without a bound an upload takes the memory of a whole model twice, and photographs queue up
-/// behind a device that is slower than the host. 128 MiB are 15 photographs at 1080p, about one look at the
-/// device.
+/// Maximum bytes of writes in staging buffers until the device has copied them; a larger write waits alone.
+/// Without a limit, an upload takes the memory of a whole model twice, and photographs queue up if the device
+/// is slower than the host. 128 MiB hold 15 photographs at 1080p, about one batch ([`BATCH`]).
 pub const STAGED_BYTES: u64 = 128 << 20;
-/// Iterations between two looks at the device, after which nothing waits in staging buffers.
+/// Iterations between two waits for the device, after which the staging buffers are empty.
 pub const BATCH: u32 = 16;
-/// Gaussians in a full block: what is read back at once.
+/// Gaussians in a full block, the unit of reading back.
 pub const BLOCK_CAPACITY: u32 = 512 * 1024;
-/// Most tiles that are worked on at once, in a strip of a picture or a band of a view. With tiles of 16 x 16
-/// their colours take 128 MiB, the smallest binding that devices have; a picture of 3840 x 2160 has fewer.
-/// With tiles of 8 x 8, on CPU adapters, it is the largest power of two that a splat can cover: lavapipe ends
-/// all loops of a thread after 65,535 rounds together, and `intersect_emit` takes one for each tile.
+/// Maximum number of tiles processed at once, in a strip of a picture or a band of a view. With tiles of 16 x
+/// 16, their colours take 128 MiB, the smallest maximum binding size of devices; a picture of 3840 x 2160 has
+/// fewer tiles. With tiles of 8 x 8, on CPU adapters, it is the largest power of two that a splat can cover.
+/// Lavapipe ends all loops of a thread after 65,535 iterations in total, and `intersect_emit` takes one per
+/// tile.
 pub const MAX_TILES: u32 = 32 * 1024;
 
-/// Side of the smallest tiles, those of CPU adapters, pixels: what a forecast takes that does not know the
-/// adapter. Tiles of a GPU are 16 x 16, so its lists by intersection are about a third shorter, by the
-/// formula of [`RunSize::lists`].
+/// Side of the smallest tiles, those of CPU adapters, pixels. Forecasts use it if the adapter is unknown.
+/// Tiles of a GPU are 16 x 16, which makes lists by intersection about a third shorter, by the formula of
+/// [`RunSize::lists`].
 pub const SMALLEST_TILE: u32 = 8;
-/// Longest binding of common GPUs, bytes (2 GiB and more): what a forecast takes that does not know the
-/// adapter. Where it is shorter (128 MiB on lavapipe), views of millions of Gaussians are cut into bands, and
-/// a run takes less.
+/// Maximum binding size of common GPUs, bytes (2 GiB and more). Forecasts use it if the adapter is unknown.
+/// With a smaller limit (128 MiB on lavapipe), views of millions of Gaussians are divided into bands, and a
+/// run takes less.
 pub const COMMON_BINDING_BYTES: u64 = 2 << 30;
 
-/// Room that lists have beyond the estimate of the fullest view, as a factor: what lies outside the picture
-/// and reaches into it, and Gaussians that move to where views are (sesa-wreck: a third of them, where a
-/// quarter of the points are).
+/// Factor on the estimated number of Gaussians in the fullest view. It covers Gaussians outside the picture
+/// that reach into it, and Gaussians that move into the views. On sesa-wreck, a view has a quarter of the
+/// points but a third of the Gaussians.
 const ROOM: f64 = 1.4;
-/// Layers of Gaussians over each tile: `(LAYERS_AT_LEAST + LAYERS_BY_DENSITY * sqrt(visible Gaussians a
+/// Layers of Gaussians over each tile: `(LAYERS_AT_LEAST + LAYERS_BY_DENSITY * sqrt(visible Gaussians per
 /// tile))^2`.
 ///
-/// A splat of r tiles touches about (1 + r)^2 of them, and splats that fill a picture have r in proportion to
-/// 1 / sqrt(density), whence the form. Fitted to the fullest views of fox, reef-clip and sesa-wreck
-/// (bench/history.jsonl).
+/// A splat r tiles wide touches about (1 + r)^2 tiles. For splats that fill a picture, r is proportional to 1
+/// / sqrt(density), which gives this form. It was fitted to the fullest views of fox, reef-clip and
+/// sesa-wreck (bench/history.jsonl).
 const LAYERS_AT_LEAST: f64 = 9.5;
 const LAYERS_BY_DENSITY: f64 = 1.75;
-/// Most intersections of a visible Gaussian in lists that are made before they are needed: a run with few
-/// Gaussians in large pictures grows its lists instead.
+/// Maximum intersections per visible Gaussian in preallocated lists: a run with few Gaussians in large
+/// pictures grows its lists instead.
 const MOST_TILES: u64 = 32;
-/// Shortest lists.
+/// Minimum lengths of lists.
 const LEAST_VISIBLE: u64 = 256;
 const LEAST_INTERSECTIONS: u64 = 4096;
 
-/// Bytes of the longest rows of the lists of a view: splats by visible Gaussian, gradients by intersection.
+/// Bytes of the longest row in the lists of a view: splats by visible Gaussian, gradients by intersection.
 pub const LONGEST_ROW_BYTES: u64 = 48;
 
-/// How long the lists of a view may be where no binding may exceed `binding_bytes`.
+/// Maximum length of the lists of a view for bindings of up to `binding_bytes`.
 pub fn most_rows(binding_bytes: u64) -> u32 {
     u32::try_from(binding_bytes / LONGEST_ROW_BYTES).unwrap_or(u32::MAX)
 }
 
-/// Bytes of the coefficients of a Gaussian: three channels of f32, four coefficients at a time.
+/// Bytes per Gaussian for its coefficients: three channels of f32, in groups of four coefficients.
 pub fn coefficient_bytes(sh_degree: u8) -> u64 {
     48 * (u64::from(sh_degree) + 1).pow(2).div_ceil(4)
 }
 
-/// Bytes of a Gaussian that is rendered and never changes, without its flag.
+/// Bytes per rendered but untrained Gaussian, without its flag.
 pub fn frozen_bytes(sh_degree: u8) -> u64 {
     TRANSFORM_BYTES + coefficient_bytes(sh_degree)
 }
 
-/// Bytes of the moments of all but the coefficients.
+/// Bytes per Gaussian for all moments except those of the coefficients.
 fn transform_moment_bytes(moments: Moments) -> u64 {
     match moments {
         Moments::Compact => 64,
@@ -111,7 +108,7 @@ fn transform_moment_bytes(moments: Moments) -> u64 {
     }
 }
 
-/// Bytes of a trained Gaussian with its moments and statistics, without its flag.
+/// Bytes per trained Gaussian with its moments and statistics, without its flag.
 pub fn trained_bytes(sh_degree: u8, moments: Moments) -> u64 {
     let colour = coefficient_bytes(sh_degree);
     let colour_moments = match moments {
@@ -121,7 +118,7 @@ pub fn trained_bytes(sh_degree: u8, moments: Moments) -> u64 {
     frozen_bytes(sh_degree) + transform_moment_bytes(moments) + colour_moments + STATISTICS_BYTES
 }
 
-/// Bytes a pixel of a training picture takes while it is trained on.
+/// Bytes per pixel of a training picture during training.
 pub fn pixel_bytes(settings: Settings<'_>) -> u64 {
     RENDER_BYTES + LOSS_BYTES + appearance::pixel_bytes(settings)
 }
@@ -133,33 +130,32 @@ pub struct Lists {
     pub visible: u32,
     /// Intersections of Gaussians with tiles.
     pub intersections: u32,
-    /// Whether the fullest views need longer ones than the device can bind, so that they are rendered in
-    /// bands.
+    /// Whether the fullest views exceed what the device can bind, so that they are rendered in bands.
     pub in_bands: bool,
 }
 
-/// What the memory of a run follows from.
+/// The quantities that determine the memory of a run.
 #[derive(Clone, Debug)]
 pub struct RunSize<'a> {
-    /// Resolved configuration, whose `iterations` is that of this run, and the water where there is one.
+    /// Resolved configuration, with the `iterations` of this run, and the water if there is one.
     pub settings: Settings<'a>,
     /// Cap on the trained Gaussians.
     pub trained: u64,
-    /// Gaussians that are rendered and do not change.
+    /// Number of Gaussians that are rendered but not trained.
     pub frozen: u64,
-    /// How many of both the fullest view sees at the cap: [`visible_in_fullest_view`].
+    /// How many of both are in the fullest view at the cap: [`visible_in_fullest_view`].
     pub visible: u64,
     /// Width and height of every training picture.
     pub pictures: &'a [[u32; 2]],
-    /// Side of a tile, pixels; [`SMALLEST_TILE`] where it is not known.
+    /// Side of a tile, pixels; [`SMALLEST_TILE`] if unknown.
     pub tile: u32,
-    /// Longest binding of the device; [`COMMON_BINDING_BYTES`] where it is not known.
+    /// Maximum binding size of the device, bytes; [`COMMON_BINDING_BYTES`] if unknown.
     pub binding_bytes: u64,
-    /// Whether held-out views are measured on the way (`train.eval_every`).
+    /// Whether held-out views are measured during the run (`train.eval_every`).
     pub measures: bool,
 }
 
-/// GPU memory of a run at its largest, by what takes it. Bytes.
+/// Peak GPU memory of a run by use, bytes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct MemoryForecast {
@@ -169,18 +165,18 @@ pub struct MemoryForecast {
     pub per_visible: u64,
     /// Lists by intersection, gradients included.
     pub per_intersection: u64,
-    /// Buffers of a picture's size: render, loss and its gradients.
+    /// Buffers of picture size: render, loss and its gradients.
     pub pixels: u64,
-    /// Photographs that stay on the device.
+    /// Photographs kept on the device.
     pub photographs: u64,
-    /// What waits on its way to the device or back: photographs, or the largest array of a checkpoint.
+    /// Pending transfers to or from the device: photographs, or the largest array of a checkpoint.
     pub transfers: u64,
-    /// The model once more with lists of its own, where held-out views are measured on the way.
+    /// A second copy of the model with its own lists, if held-out views are measured during the run.
     pub measuring: u64,
 }
 
 impl MemoryForecast {
-    /// All parts together.
+    /// The sum of all parts.
     pub fn total(&self) -> u64 {
         let Self { gaussians, per_visible, per_intersection, pixels, photographs, transfers, measuring } =
             self;
@@ -189,9 +185,8 @@ impl MemoryForecast {
 }
 
 impl RunSize<'_> {
-    /// How long lists the run should begin with: enough for its fullest view at the cap, as far as that can
-    /// be foreseen and the device can bind them. They grow where a view needs more; nothing that is trained
-    /// depends on them.
+    /// Initial lengths of the lists: enough for the fullest view at the cap, as far as it can be predicted
+    /// and the device can bind them. They grow if a view needs more. Training results do not depend on them.
     pub fn lists(&self) -> Lists {
         let all = self.trained + self.frozen;
         let visible = ((self.visible as f64 * ROOM).ceil() as u64).min(all).max(LEAST_VISIBLE.min(all));
@@ -207,7 +202,7 @@ impl RunSize<'_> {
         }
     }
 
-    /// Bytes of a trained Gaussian without its flag: [`trained_bytes`], and sums where views are rendered in
+    /// Bytes per trained Gaussian without its flag: [`trained_bytes`], plus sums if views are rendered in
     /// bands.
     pub fn trained_bytes(&self) -> u64 {
         let bands = if self.lists().in_bands { BAND_BYTES } else { 0 };
@@ -215,11 +210,11 @@ impl RunSize<'_> {
         trained_bytes(config.sh_degree, config.moments) + bands
     }
 
-    /// What the run takes on the device at its largest, besides half a MiB of wgpu's own and less than 1 %
-    /// for tiles, histograms and uniforms.
+    /// Peak memory of the run on the device, except half a MiB for wgpu and less than 1 % for tiles,
+    /// histograms and uniforms.
     ///
-    /// That is the peak of the allocator: all lists and photographs there, and the largest transfer under
-    /// way. Where the device keeps up with the uploads the transfer is smaller.
+    /// This is the peak of the allocator: all lists and photographs are present, and the largest transfer is
+    /// in progress. If the device keeps up with the uploads, the transfer is smaller.
     pub fn forecast(&self) -> MemoryForecast {
         let config = self.settings.train;
         let all = self.trained + self.frozen;
@@ -248,7 +243,7 @@ impl RunSize<'_> {
         }
     }
 
-    /// Bytes of the photographs that the run keeps: each at every size at which it is seen, the latest ones.
+    /// Bytes of the photographs that the run keeps: each at every size used, up to [`RESIDENT_BYTES`].
     fn photographs(&self) -> u64 {
         let views = self.pictures.len().max(1) as f64;
         let iterations = f64::from(self.settings.train.iterations);
@@ -278,16 +273,16 @@ fn area([width, height]: &[u32; 2]) -> u64 {
     u64::from(*width) * u64::from(*height)
 }
 
-/// Points that [`visible_in_fullest_view`] looks at, of each group, and views.
+/// Maximum points per group, and maximum views, that [`visible_in_fullest_view`] samples.
 const MOST_POINTS: usize = 8192;
 const MOST_VIEWS: usize = 512;
 
-/// How many Gaussians views see.
+/// Numbers of Gaussians in views.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Visible {
-    /// In the picture of the view that has most of them.
+    /// In the view that has the most.
     pub fullest: u64,
-    /// As a mean over views.
+    /// Mean over views.
     pub mean: f64,
 }
 
@@ -299,11 +294,11 @@ pub fn visible_in_fullest_view(
     visible_in_views(views, groups).fullest
 }
 
-/// Gaussians that lie in the pictures of views.
+/// Counts the Gaussians in the pictures of views.
 ///
-/// `groups` are Gaussians (or the points for which they stand) with the number that there will be of them:
-/// the share of the points before a view stands for the share of the Gaussians. Points and views are thinned
-/// out evenly; a group without points counts as seen.
+/// `groups` are Gaussians (or points that represent them), each with its eventual number of Gaussians. The
+/// share of the points in a view is taken as the share of the Gaussians. Points and views are thinned evenly.
+/// A group without points counts as visible in every view.
 pub fn visible_in_views(
     views: impl ExactSizeIterator<Item = (PinholeCamera, Pose)>,
     groups: &[(&[DVec3], u64)],
@@ -355,15 +350,15 @@ mod tests {
     }
 
     #[test]
-    fn under_half_a_kilobyte_a_gaussian_of_sh_3_with_compact_moments() {
+    fn bytes_per_gaussian_match_the_layout() {
         assert_eq!(trained_bytes(3, Moments::Compact), 416);
         assert_eq!(trained_bytes(3, Moments::F32), 736);
-        // 1, 4, 9 and 16 coefficients lie in 1, 1, 3 and 4 groups of four.
+        // 1, 4, 9 and 16 coefficients take 1, 1, 3 and 4 groups of four.
         assert_eq!([0, 1, 2, 3].map(frozen_bytes), [96, 96, 192, 240]);
     }
 
     #[test]
-    fn the_view_that_has_most_gaussians_counts_and_each_group_by_its_own_points() {
+    fn fullest_view_counts_each_group_by_its_own_points() {
         let camera = PinholeCamera { width: 100, height: 100, fx: 100.0, fy: 100.0, cx: 50.0, cy: 50.0 };
         let looking = |at| (camera, Pose::looking_at(DVec3::ZERO, at, DVec3::Y));
         let ahead = DVec3::new(0.0, 0.0, 5.0);
@@ -372,14 +367,14 @@ mod tests {
         let visible = |groups: &[(&[DVec3], u64)]| visible_in_fullest_view(views.iter().copied(), groups);
         assert_eq!(visible(&[(&left, 1000)]), 500);
         assert_eq!(visible(&[(&left, 1000), (&mixed, 60)]), 530);
-        assert_eq!(visible(&[(&left, 1000), (&[], 70)]), 570, "what has no points may be anywhere");
+        assert_eq!(visible(&[(&left, 1000), (&[], 70)]), 570, "a group without points may be anywhere");
         // The other view sees one of the four and one of the two.
         let both = visible_in_views(views.iter().copied(), &[(&left, 1000), (&mixed, 60), (&[], 7)]);
         assert_eq!(both, Visible { fullest: 537, mean: 7.0 + (530.0 + 250.0) / 2.0 });
     }
 
     #[test]
-    fn lists_are_no_longer_than_a_binding_and_then_sums_of_bands_come_on_top() {
+    fn lists_beyond_a_binding_are_cut_and_bands_add_sums() {
         let config = TrainConfig::default();
         let pictures = [[1600, 1200]];
         let whole = run(&config, 800_000, &pictures);
@@ -387,21 +382,21 @@ mod tests {
         assert!(!whole.lists().in_bands && whole.lists().intersections > 1 << 20);
         assert_eq!(cut.lists(), Lists { visible: 1_000_000, intersections: 1 << 20, in_bands: true });
         assert_eq!(cut.forecast().gaussians - whole.forecast().gaussians, 48_000_000);
-        // So do pictures of more tiles than are worked on at once: 200 by 164 of 8 pixels.
+        // Pictures with more than the maximum number of tiles also need bands: 200 by 164 tiles of 8 pixels.
         let (most, more) = ([[1600, 1304]], [[1600, 1320]]);
         let bands = |pictures| RunSize { tile: 8, ..run(&config, 100_000, pictures) }.lists().in_bands;
         assert!(!bands(&most) && bands(&more));
     }
 
     #[test]
-    fn photographs_count_at_every_size_at_which_they_are_seen_up_to_what_stays() {
+    fn photographs_count_at_every_size_used_up_to_the_limit() {
         let long = TrainConfig { iterations: 1000, ..TrainConfig::default() };
         let at =
             |config: &TrainConfig, pictures: &[[u32; 2]]| run(config, 1, pictures).forecast().photographs;
         let full = 4 * 400 * 400;
         assert_eq!(at(&long, &[[400, 400]; 10]), 10 * (full + full / 4 + full / 16));
         assert_eq!(at(&long.clone().continued(), &[[400, 400]; 10]), 10 * full);
-        // At most halved once, so that 96 pixels are left.
+        // Halved at most once, so that at least 96 pixels remain.
         assert_eq!(at(&long, &[[200, 200]; 10]), 10 * (full / 4 + full / 16));
         // 7 iterations at full size, 2 and 1 at the others.
         let short = TrainConfig { iterations: 10, ..TrainConfig::default() };

@@ -1,9 +1,9 @@
-//! Colours for viewers: harmonics with which programs that blend in sRGB show a model as it is that was
-//! blended in linear light.
+//! Colours for viewers: harmonics with which viewers that blend in sRGB reproduce a model that was blended in
+//! linear light.
 //!
-//! Light that is encoded after it was blended is brighter than the blend of what was encoded before, wherever
-//! Gaussians of different colours lie over each other: no Gaussian's colour alone can make up for that. So
-//! the colours, and nothing else, are trained against the model's own pictures.
+//! Light that is blended and then encoded is brighter than a blend of encoded light, wherever Gaussians of
+//! different colours overlap. The colour of a single Gaussian cannot compensate for this. The colours alone
+//! are therefore trained against the model's own pictures.
 
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -15,28 +15,28 @@ use crate::train::{Progress, TrainRun, Trainer};
 use crate::views::{PackedImage, TrainView, ViewSource};
 use crate::{CoreError, Result};
 
-/// How colours are found.
+/// Settings for the training of colours.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ViewerColours {
-    /// Iterations; one sees one view.
+    /// Number of iterations, each with one view.
     pub iterations: u32,
-    /// Of the order of the views.
+    /// Seed for the order of the views.
     pub seed: u32,
 }
 
-/// Iterations that are done between two calls of `report`.
+/// Iterations between two calls of `report`.
 const REPORT_EVERY: u32 = 50;
-/// Adam's rates of the constant colour and of all higher bands: on sesa-wreck trained in linear light, 3000
-/// iterations from 33.20 dB gave 42.95 dB with these, and 41.85 dB with twice the second.
+/// Adam's learning rates of the constant colour and of all higher bands. On sesa-wreck trained in linear
+/// light, 3000 iterations raised 33.20 dB to 42.95 dB. With twice the second rate it was 41.85 dB.
 const DC_RATE: f32 = 0.02;
 const REST_RATE: f32 = 0.002;
 
 impl ViewerColours {
-    /// `model` with other colours: blended in sRGB over black, it shows from `views` what the model shows
-    /// through `shown` (J, with [`crate::gpu::Output::Restored`]). Positions, shapes and opacities stay to
-    /// the bit.
+    /// `model` with new colours: blended in sRGB over black, it reproduces from `views` the pictures of the
+    /// model through `shown` (J, with [`crate::gpu::Output::Restored`]). Positions, shapes and opacities stay
+    /// bit-identical.
     ///
-    /// `report` is told where the training stands.
+    /// `report` receives the progress of the training.
     ///
     /// # Errors
     /// When there are no views or no Gaussians, or the device fails or cannot hold the model twice.
@@ -52,7 +52,7 @@ impl ViewerColours {
         let pictures = OwnPictures { views, renderer: Mutex::new(renderer) };
         let run = TrainRun {
             config: self.config(model),
-            // Only means have a rate that depends on it.
+            // Only the rate of the means depends on it.
             extent: 1.0,
             views: Arc::new(pictures),
             focus: model.clone(),
@@ -72,7 +72,8 @@ impl ViewerColours {
         Ok(Gaussians { sh_coeffs: trained.sh_coeffs, ..model.clone() })
     }
 
-    /// Rates for colours alone. What is compared are means over pixels, so L1 and SSIM weigh as in training.
+    /// Rates for colours alone. The pictures are compared as in training, so L1 and SSIM have their usual
+    /// weights.
     fn config(self, model: &Gaussians) -> TrainConfig {
         TrainConfig {
             seed: self.seed,
@@ -97,7 +98,7 @@ impl ViewerColours {
     }
 }
 
-/// What the model shows itself, in the place of photographs.
+/// The model's own pictures, in place of photographs.
 struct OwnPictures {
     views: Vec<TrainView>,
     renderer: Mutex<Renderer>,
@@ -111,7 +112,7 @@ impl ViewSource for OwnPictures {
     fn load(&self, index: usize) -> Result<Arc<PackedImage>> {
         let view =
             self.views.get(index).ok_or_else(|| CoreError::Scene(format!("there is no view {index}")))?;
-        // A renderer whose last user panicked overwrites all that it left.
+        // After a panic of its last user, a renderer overwrites any partial state.
         let mut renderer = self.renderer.lock().unwrap_or_else(PoisonError::into_inner);
         let rendered = renderer.render(&view.camera, &view.pose, [0.0; 3])?;
         Ok(Arc::new(quantised(rendered.width, rendered.height, &rendered.rgb)))

@@ -1,13 +1,13 @@
-//! The brightness and the white of pictures of J, for people: one gain a channel in linear light, by a rule
-//! that is written down.
+//! Brightness and white balance of J in pictures for people: one gain per channel in linear light, by a
+//! documented rule.
 //!
-//! What no photograph can tell is one gain of J a channel, so whoever looks at J may choose it. Nothing here
-//! touches a model that is kept, and no comparison with a truth uses it.
+//! Photographs cannot determine the scale of J, which is free by one gain per channel. These gains choose it
+//! for display. They never change a stored model, and comparisons with ground truth do not use them.
 //!
-//! Two rules, alone or one after the other. A colour, or the mean of grey patches of a chart, becomes neutral
-//! and keeps its luminance. And [`Exposure`], the same gain for all channels: of the pixels that show
-//! surfaces (alpha above [`SURFACE`]) the 99th percentile of the brightest channel becomes 0.9 of white in
-//! sRGB.
+//! There are two rules, used alone or in sequence. The first makes a colour, or the mean of grey patches of a
+//! chart, neutral and keeps its luminance. The second is [`Exposure`], the same gain for all channels. Over
+//! pixels that show surfaces (alpha above [`SURFACE`]), it takes the 99th percentile of the brightest channel
+//! to 0.9 of white in sRGB.
 
 use serde::{Deserialize, Serialize};
 
@@ -16,33 +16,33 @@ use crate::linear_colours::refitted;
 use crate::picture::{linear_to_srgb, srgb_to_linear};
 use crate::{CoreError, Result};
 
-/// A pixel shows a surface where alpha is above this.
+/// Alpha above which a pixel shows a surface.
 pub const SURFACE: f32 = 0.9;
-/// Share of the pixels of surfaces whose brightest channel is at most [`BRIGHT`]; what is above are
-/// highlights and strays.
+/// Share of the surface pixels whose brightest channel is at most [`BRIGHT`]; the rest are highlights and
+/// outliers.
 pub const PERCENTILE: f64 = 0.99;
-/// What that percentile becomes, sRGB 0..1: below white, so that few are clipped.
+/// Target of that percentile, sRGB 0..1: below white, so that few pixels are clipped.
 pub const BRIGHT: f64 = 0.9;
-/// Pixels on each side of the position of a patch that are averaged: 5 x 5.
+/// Pixels averaged on each side of the position of a patch: 5 x 5 in total.
 const PATCH: i64 = 2;
-/// Least light in a channel that can be made neutral, linear: below a third of an 8-bit step there is only
+/// Minimum light in each channel for a neutral colour, linear: below a third of an 8-bit step there is only
 /// noise.
 const LEAST: f64 = 1e-4;
 /// Luminance of linear sRGB (IEC 61966-2-1).
 const LUMINANCE: [f64; 3] = [0.2126, 0.7152, 0.0722];
 
-/// What was chosen, and by which rule: the content of `white_point.json`.
+/// The gains and their rule: the content of `white_point.json`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct WhitePoint {
-    /// `auto`, `colour`, `chart`, or `chart, auto` where the second came after the first.
+    /// `auto`, `colour`, `chart`, or for example `chart, auto` if both rules were used.
     pub rule: String,
     /// Factors on red, green and blue in linear light.
     pub gains: [f64; 3],
-    /// The colour that became neutral, linear light before the gains; absent where none did.
+    /// The colour that became neutral, linear light before the gains; absent without one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub neutral: Option<[f64; 3]>,
-    /// Where it comes from, if from a chart.
+    /// The source of that colour, if it was a chart.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub chart: Option<Chart>,
 }
@@ -60,7 +60,7 @@ pub struct Chart {
 /// Gains that make `colour` (linear light) neutral without changing its luminance.
 ///
 /// # Errors
-/// When a channel has no light that could be made neutral, or is no number.
+/// When a channel is not a number or has too little light.
 pub fn neutral(colour: [f64; 3]) -> Result<[f64; 3]> {
     if !colour.iter().all(|value| value.is_finite() && *value >= LEAST) {
         return Err(CoreError::Config(format!(
@@ -73,11 +73,11 @@ pub fn neutral(colour: [f64; 3]) -> Result<[f64; 3]> {
 }
 
 /// The mean colour, linear light, of the patches at `positions` (pixels from the top-left corner) of a
-/// picture with `width` columns: `rgb` `[H*W]` sRGB, `alpha` `[H*W]`. A patch is 5 x 5 pixels, less at the
-/// rim.
+/// picture with `width` columns: `rgb` `[H*W]` sRGB, `alpha` `[H*W]`. A patch is 5 x 5 pixels, fewer at the
+/// edge.
 ///
 /// # Errors
-/// When there is no position, one lies outside, or its patch is not a surface.
+/// When there is no position, one is outside the picture, or its patch does not show a surface.
 pub fn mean_of_patches(
     rgb: &[[f32; 3]],
     alpha: &[f32],
@@ -86,13 +86,13 @@ pub fn mean_of_patches(
 ) -> Result<[f64; 3]> {
     let refuse = |[x, y]: [f64; 2], why: String| CoreError::Config(format!("the patch at {x},{y} {why}"));
     if positions.is_empty() {
-        return Err(CoreError::Config("a chart needs the position of a patch at least".to_owned()));
+        return Err(CoreError::Config("a chart needs the position of at least one patch".to_owned()));
     }
     let width = i64::from(width);
     let height = rgb.len() as i64 / width.max(1);
     let mut mean = [0.0; 3];
     for &position in positions {
-        // Phrased positively, so that NaN lies outside.
+        // Phrased positively, so that NaN counts as outside.
         let within = |v: f64, size: i64| v >= 0.0 && v < size as f64;
         if !(within(position[0], width) && within(position[1], height)) {
             return Err(refuse(position, format!("lies outside of the picture, which is {width}x{height}")));
@@ -116,39 +116,39 @@ pub fn mean_of_patches(
     Ok(mean)
 }
 
-/// Finds the gain with which surfaces are neither clipped nor dim.
+/// Finds the gain that makes surfaces neither clipped nor dim.
 ///
-/// Counts in classes of 1/128 octave, so that it takes in any number of pictures: the percentile is right to
-/// 0.3 %.
+/// Counts pixels in classes of 1/128 octave, so any number of pictures can be added. The percentile is
+/// accurate to 0.3 %.
 #[derive(Clone, Debug)]
 pub struct Exposure {
     gains: [f64; 3],
     classes: Vec<u64>,
 }
 
-/// Classes of an octave.
+/// Classes per octave.
 const OCTAVE: f64 = 128.0;
-/// Lowest and highest octave: from a hundredth of an 8-bit step to 256 times white.
+/// Lowest and highest octave: a hundredth of an 8-bit step to 256 times white.
 const OCTAVES: [f64; 2] = [-16.0, 8.0];
 
 impl Exposure {
-    /// Of pictures to which `gains` are applied before.
+    /// For pictures to which `gains` are applied first.
     pub fn after(gains: [f64; 3]) -> Self {
         Self { gains, classes: vec![0; ((OCTAVES[1] - OCTAVES[0]) * OCTAVE) as usize] }
     }
 
-    /// Takes in a picture: `rgb` sRGB and `alpha`, both `[H*W]`.
+    /// Adds a picture: `rgb` sRGB and `alpha`, both `[H*W]`.
     pub fn add(&mut self, rgb: &[[f32; 3]], alpha: &[f32]) {
         for (rgb, _) in rgb.iter().zip(alpha).filter(|(_, alpha)| **alpha > SURFACE) {
             let brightest = (0..3).map(|c| self.gains[c] * light(rgb[c])).fold(0.0, f64::max);
-            // The cast takes what is below all classes, as black is, into the first.
+            // The cast maps values below all classes, such as black, to the first class.
             let class = ((brightest.log2() - OCTAVES[0]) * OCTAVE) as usize;
             let last = self.classes.len() - 1;
             self.classes[class.min(last)] += 1;
         }
     }
 
-    /// The gains from before times that of the exposure.
+    /// The initial gains times that of the exposure.
     ///
     /// # Errors
     /// When no pixel shows a surface, or surfaces are black.
@@ -156,8 +156,8 @@ impl Exposure {
         let count: u64 = self.classes.iter().sum();
         if count == 0 {
             return Err(CoreError::Config(format!(
-                "no pixel of the pictures shows a surface (alpha above {SURFACE}), so none can say how bright they should be; \
-                 choose other cameras, or leave --white-point auto out"
+                "no pixel of the pictures shows a surface (alpha above {SURFACE}), so their brightness cannot be chosen; \
+                 choose other cameras, or omit --white-point auto"
             )));
         }
         let rank = (PERCENTILE * count as f64).ceil() as u64;
@@ -168,7 +168,7 @@ impl Exposure {
         });
         let class = class.filter(|class| *class > 0).ok_or_else(|| {
             CoreError::Config(
-                "all surfaces of the pictures are black, and no gain makes them brighter; leave --white-point auto out".to_owned(),
+                "all surfaces of the pictures are black, and no gain makes them brighter; omit --white-point auto".to_owned(),
             )
         })?;
         let percentile = ((class as f64 + 0.5) / OCTAVE + OCTAVES[0]).exp2();
@@ -184,23 +184,23 @@ pub fn apply(rgb: &mut [[f32; 3]], gains: [f64; 3]) {
     }
 }
 
-/// The model with gains on its colours, which are sRGB: of each Gaussian the harmonics nearest to its colour
-/// after the gains, least squares over all directions. Exact for degree 0.
+/// The model with gains on its sRGB colours. The harmonics of each Gaussian are refitted to its colours after
+/// the gains, by least squares over all directions. Exact for degree 0.
 ///
-/// The sRGB curve is a power with an offset but near black, so a gain changes all colours alike by a factor
-/// and an offset, and what is blended to an alpha of 1 is changed as the picture is.
+/// Except near black, the sRGB curve is a power with an offset, so a gain changes all colours by the same
+/// factor and offset. A blend with an alpha of 1 therefore changes like the picture.
 #[must_use]
 pub fn in_srgb(model: Gaussians, gains: [f64; 3]) -> Gaussians {
     refitted(model, |rgb| std::array::from_fn(|c| linear_to_srgb(gains[c] * srgb_to_linear(rgb[c].max(0.0)))))
 }
 
-/// The same of a model whose colours are in linear light; exact.
+/// The same for a model whose colours are in linear light; exact.
 #[must_use]
 pub fn in_linear_light(mut model: Gaussians, gains: [f64; 3]) -> Gaussians {
     let coeffs = model.coeffs();
     for (index, coefficient) in model.sh_coeffs.iter_mut().enumerate() {
         for (value, gain) in coefficient.iter_mut().zip(gains) {
-            // Colours are 0.5 above what the harmonics give.
+            // Colours are the harmonics plus 0.5.
             let offset = if index % coeffs == 0 { 0.5 * (gain - 1.0) / f64::from(SH_C0) } else { 0.0 };
             *value = (gain * f64::from(*value) + offset) as f32;
         }
@@ -208,7 +208,7 @@ pub fn in_linear_light(mut model: Gaussians, gains: [f64; 3]) -> Gaussians {
     model
 }
 
-/// Linear light of an sRGB value, 0 below it.
+/// Linear light of an sRGB value; 0 for negative values.
 fn light(value: f32) -> f64 {
     srgb_to_linear(f64::from(value).max(0.0))
 }
@@ -218,7 +218,7 @@ mod tests {
 
     use super::*;
 
-    /// A row of greys of light from 0 to `most`, the last ones with little alpha and much light.
+    /// A row of greys with light from 0 to `most`, then bright pixels with little alpha.
     fn row(most: f64) -> (Vec<[f32; 3]>, Vec<f32>) {
         let mut rgb: Vec<[f32; 3]> = (0..1000)
             .map(|i| {
@@ -233,7 +233,7 @@ mod tests {
     }
 
     #[test]
-    fn the_brightest_surfaces_become_nine_tenths_of_white_whatever_they_were() {
+    fn brightest_surfaces_become_nine_tenths_of_white() {
         for most in [0.02, 0.4, 3.0] {
             let (mut rgb, alpha) = row(most);
             let mut exposure = Exposure::after([1.0; 3]);
@@ -241,14 +241,14 @@ mod tests {
             let gains = exposure.gains().unwrap();
             assert!(gains[0] == gains[1] && gains[1] == gains[2], "one gain: {gains:?}");
             apply(&mut rgb, gains);
-            // Classes are half a percent wide in light, a quarter in sRGB.
+            // Classes are half a percent wide in light, a quarter of a percent in sRGB.
             assert!((f64::from(rgb[989][0]) - BRIGHT).abs() < 0.003, "{most}: {:?}", rgb[989]);
             assert!(rgb[..1000].iter().flatten().all(|value| *value < 1.0), "nothing is clipped");
         }
     }
 
     #[test]
-    fn exposure_comes_after_what_makes_a_colour_neutral() {
+    fn exposure_keeps_a_neutral_colour_neutral() {
         let (mut rgb, alpha) = row(0.3);
         let neutral = neutral([0.3, 0.15, 0.24]).unwrap();
         let mut exposure = Exposure::after(neutral);
@@ -259,7 +259,7 @@ mod tests {
     }
 
     #[test]
-    fn a_colour_becomes_neutral_and_keeps_its_luminance() {
+    fn neutral_colour_keeps_its_luminance() {
         let colour = [0.1, 0.4, 0.3];
         let gains = neutral(colour).unwrap();
         let grey = [0, 1, 2].map(|c| gains[c] * colour[c]);
@@ -271,7 +271,7 @@ mod tests {
     }
 
     #[test]
-    fn patches_are_averaged_in_linear_light_and_must_be_surfaces_in_the_picture() {
+    fn patches_must_be_surfaces_and_are_averaged_linearly() {
         let mut rgb = vec![[0.2_f32, 0.4, 0.6]; 12 * 6];
         rgb[2 * 12 + 2] = [1.0; 3];
         let mut alpha = vec![1.0; 12 * 6];
@@ -303,7 +303,7 @@ mod tests {
     }
 
     #[test]
-    fn gains_on_a_model_are_gains_on_what_it_shows() {
+    fn gains_on_a_model_are_gains_on_its_pictures() {
         let gains = [2.0, 1.0, 0.5];
         let colour = [0.3_f64, 0.5, 0.7];
         let model = Gaussians {
@@ -325,11 +325,11 @@ mod tests {
         let linear = in_linear_light(model.clone(), gains);
         for c in 0..3 {
             let expected = linear_to_srgb(gains[c] * srgb_to_linear(colour[c]));
-            // The harmonics of degree 1 bend the curve by their square.
+            // The curvature over the harmonics of degree 1 is of second order.
             assert!((shown(&srgb, c) - expected).abs() < 1e-3, "channel {c}: {}", shown(&srgb, c));
             assert!((shown(&linear, c) - gains[c] * colour[c]).abs() < 1e-6);
             assert!((f64::from(linear.sh_coeffs[1][c]) - gains[c] * 0.02).abs() < 1e-7);
-            // The slope of the curve with the gain against that without it.
+            // The ratio of the slopes of the curve with and without the gain.
             let factor = f64::from(srgb.sh_coeffs[1][c]) / 0.02;
             assert!((factor - gains[c].powf(1.0 / 2.4)).abs() < 0.01, "channel {c}: {factor}");
         }

@@ -1,4 +1,4 @@
-//! Appearances on the device: the trait, and the chain of those that a run has.
+//! Appearances on the device: the trait, and the chain of appearances in a run.
 //!
 //! ```text
 //! Gaussians -> blended picture -> first -> ... -> last -> loss
@@ -13,21 +13,21 @@ use crate::gpu::{Blocks, DevicePhotograph, Frame, Gpu, Recorder, StepUniform};
 use crate::views::TrainView;
 use crate::{CoreError, Result};
 
-/// What an appearance is made from.
+/// The inputs for creating an appearance.
 pub struct Start<'a> {
     /// The device.
     pub gpu: &'a Gpu,
-    /// What decides on appearances.
+    /// The settings that select appearances.
     pub settings: Settings<'a>,
-    /// The water of the run, where it has one.
+    /// The water of the run, if it has one.
     pub medium: Option<&'a MediumRun>,
     /// Number of training views.
     pub views: u32,
-    /// Blocks of Gaussians that are trained.
+    /// Number of trained blocks of Gaussians.
     pub blocks: u32,
 }
 
-/// One iteration as an appearance sees it.
+/// The data of one iteration for an appearance.
 #[derive(Clone, Copy)]
 pub struct Iteration<'a> {
     /// The device.
@@ -36,42 +36,42 @@ pub struct Iteration<'a> {
     pub frame: &'a Frame,
     /// The Gaussians.
     pub blocks: &'a Blocks,
-    /// The photograph of the view: its size is that of the picture.
+    /// The photograph of the view; the picture has the same size.
     pub photograph: &'a DevicePhotograph,
     /// Number of the iteration, from 0.
     pub number: u32,
-    /// Iterations of the run.
+    /// Number of iterations of the run.
     pub iterations: u32,
     /// Index of the view.
     pub view: u32,
     /// Number of training views.
     pub views: u32,
-    /// How often the picture is halved.
+    /// How many times the picture is halved.
     pub level: u32,
-    /// Whether WaterParamPredict made the water of this iteration from this view.
+    /// Whether WaterParamPredict predicted the water of this iteration from this view.
     pub is_predicted: bool,
 }
 
 impl Iteration<'_> {
-    /// Share of the run that lies before the iteration.
+    /// Share of the run before the iteration.
     pub fn progress(&self) -> f32 {
         self.number as f32 / self.iterations as f32
     }
 }
 
-/// Gradients that travel back through the chain.
+/// Gradients passed back through the chain.
 #[derive(Clone, Copy)]
 pub struct Gradients<'a> {
-    /// The photograph that the loss compared last, `[H*W]` packed.
+    /// The photograph that the loss compared with the picture, `[H*W]` packed.
     pub truth: &'a wgpu::Buffer,
-    /// `[H*W]` vec4: gradient by the picture that an appearance gave. It leaves the gradient by the picture
-    /// that it took.
+    /// `[H*W]` vec4: before a backward pass, the gradient of the appearance's output picture; after it, of
+    /// its input picture.
     pub v_image: &'a wgpu::Buffer,
-    /// `[H*W]`: gradient by the range image. An appearance that looks at ranges adds to it.
+    /// `[H*W]`: gradient of the range image. An appearance that uses ranges adds to it.
     pub v_range: &'a wgpu::Buffer,
 }
 
-/// The gradients of a view's splats, before the Gaussians move.
+/// The gradients of a view's splats, before the step of the Gaussians.
 #[derive(Clone, Copy)]
 pub struct SplatGradients<'a> {
     /// The view.
@@ -80,22 +80,22 @@ pub struct SplatGradients<'a> {
     pub blocks: &'a Blocks,
     /// `[intersections*3]` vec4: gradients of the splats by tile.
     pub slots: &'a wgpu::Buffer,
-    /// Whether the view was rendered in bands: then the gradients are sums by Gaussian, in the blocks.
+    /// Whether the view was rendered in bands. The gradients are then sums by Gaussian, in the blocks.
     pub in_bands: bool,
 }
 
-/// A differentiable step between Gaussians and loss, with parameters of its own.
+/// A differentiable step between Gaussians and loss, with its own parameters.
 pub trait Appearance: Any + Send + Sync {
-    /// Makes room for pictures of `size`. Called before every iteration: room that is there stays.
+    /// Allocates buffers for pictures of `size`. Called before every iteration; sufficient buffers are kept.
     ///
     /// # Errors
     /// When the device cannot hold it.
     fn prepare(&mut self, gpu: &Gpu, size: [u32; 2]) -> Result<()>;
 
-    /// Records the step on `image`, `[H*W]` vec4; returns what comes next in the chain, of the same form.
+    /// Records the step on `image`, `[H*W]` vec4; returns the input of the next step, in the same form.
     ///
     /// # Errors
-    /// When a kernel does not compile or no room was made.
+    /// When a kernel does not compile or `prepare` was not called.
     fn record<'a>(
         &'a self,
         recorder: &mut Recorder<'_>,
@@ -103,12 +103,12 @@ pub trait Appearance: Any + Send + Sync {
         image: &'a wgpu::Buffer,
     ) -> Result<&'a wgpu::Buffer>;
 
-    /// Records the backward pass of [`Appearance::record`], which had the same `image`, and the step of the
-    /// parameters, unless they move after the Gaussians ([`Appearance::record_step`]). No parameter moves
-    /// while the frame's counters say that a list was too short.
+    /// Records the backward pass of [`Appearance::record`], which had the same `image`, and the parameter
+    /// step. Some appearances step after the Gaussians instead ([`Appearance::record_step`]). Parameters stay
+    /// unchanged if the frame's counters report an overflowing list.
     ///
     /// # Errors
-    /// When a kernel does not compile or no room was made.
+    /// When a kernel does not compile or `prepare` was not called.
     fn record_backward(
         &self,
         recorder: &mut Recorder<'_>,
@@ -117,24 +117,24 @@ pub trait Appearance: Any + Send + Sync {
         gradients: Gradients<'_>,
     ) -> Result<()>;
 
-    /// How `project_forward` makes colours (`Frame.medium` in the shaders); `None` where this appearance does
+    /// How `project_forward` computes colours (`Frame.medium` in the shaders); `None` if this appearance does
     /// not change them.
     fn colouring(&self) -> Option<u32> {
         None
     }
 
-    /// Changes the rates and weights of the Gaussians' step for a view.
+    /// Adjusts the rates and weights of the Gaussians' step for a view.
     fn weigh(&self, _step: &mut StepUniform, _view: &TrainView) {}
 
-    /// Whether [`Appearance::record_gradients`] and [`Appearance::record_step`] are due in an iteration.
+    /// Whether an iteration includes [`Appearance::record_gradients`] and [`Appearance::record_step`].
     fn steps_with_gaussians(&self, _now: &Iteration<'_>) -> bool {
         false
     }
 
-    /// Records what goes from the gradients of the splats to the parameters, before the Gaussians move.
+    /// Records the gradients from the splats to the parameters, before the step of the Gaussians.
     ///
     /// # Errors
-    /// When a kernel does not compile or no room was made.
+    /// When a kernel does not compile or `prepare` was not called.
     fn record_gradients(
         &self,
         _gpu: &Gpu,
@@ -144,24 +144,24 @@ pub trait Appearance: Any + Send + Sync {
         Ok(())
     }
 
-    /// Records the step of parameters on which the Gaussians' gradients depend, after the Gaussians have
-    /// moved.
+    /// Records the parameter step after the step of the Gaussians, for parameters that the gradients of the
+    /// Gaussians depend on.
     ///
     /// # Errors
-    /// When a kernel does not compile or no room was made.
+    /// When a kernel does not compile or `prepare` was not called.
     fn record_step(&self, _recorder: &mut Recorder<'_>, _frame: &Frame) -> Result<()> {
         Ok(())
     }
 
-    /// Buffers that outlive an iteration, with the bytes that count: the content of a checkpoint.
+    /// Buffers that persist across iterations, with their used bytes: the content of a checkpoint.
     fn arrays<'a>(&'a self, frame: &'a Frame) -> Vec<(&'a wgpu::Buffer, usize)>;
 
-    /// The water, in the appearance that is one.
+    /// The water, if this appearance is one.
     fn water(&self) -> Option<&DeviceMedium> {
         None
     }
 
-    /// The same, to change it.
+    /// Mutable access to the water.
     fn water_mut(&mut self) -> Option<&mut DeviceMedium> {
         None
     }
@@ -173,7 +173,7 @@ pub struct Chain {
 }
 
 impl Chain {
-    /// Those that the settings name, at the start of a run.
+    /// The appearances selected by the settings, at the start of a run.
     ///
     /// # Errors
     /// When the device cannot hold them.
@@ -182,22 +182,22 @@ impl Chain {
         Ok(Self { appearances: appearances.collect::<Result<_>>()? })
     }
 
-    /// The appearance of this type, where the run has it.
+    /// The appearance of this type, if the run has it.
     pub fn get<T: Appearance>(&self) -> Option<&T> {
         self.appearances.iter().find_map(|appearance| (appearance.as_ref() as &dyn Any).downcast_ref())
     }
 
-    /// The water, where the run has one.
+    /// The water, if the run has one.
     pub fn water(&self) -> Option<&DeviceMedium> {
         self.appearances.iter().find_map(|appearance| appearance.water())
     }
 
-    /// The same, to change it.
+    /// Mutable access to the water.
     pub fn water_mut(&mut self) -> Option<&mut DeviceMedium> {
         self.appearances.iter_mut().find_map(|appearance| appearance.water_mut())
     }
 
-    /// Puts the water of `start` in the place of the one that the run has. There is no room for pictures yet.
+    /// Replaces the water of the run by that of `start`. The new water has no picture buffers yet.
     ///
     /// # Errors
     /// [`CoreError::Config`] when one of the two is missing; also when the device cannot hold the water.
@@ -205,7 +205,7 @@ impl Chain {
         let at_water = |chain: &Self| chain.appearances.iter().position(|one| one.water().is_some());
         let missing = || CoreError::Config("a run without a water has none to exchange".to_owned());
         let at = at_water(self).ok_or_else(missing)?;
-        // Both together would take more memory than the run ever has.
+        // Dropped first: together they would need more memory than the run ever has.
         drop(self.appearances.remove(at));
         let mut fresh = Self::new(start)?;
         let theirs = at_water(&fresh).ok_or_else(missing)?;
@@ -213,7 +213,7 @@ impl Chain {
         Ok(())
     }
 
-    /// [`Appearance::prepare`] of all.
+    /// [`Appearance::prepare`] of all appearances.
     ///
     /// # Errors
     /// When the device cannot hold them.
@@ -221,21 +221,21 @@ impl Chain {
         self.appearances.iter_mut().try_for_each(|appearance| appearance.prepare(gpu, size))
     }
 
-    /// [`Appearance::colouring`] of the appearance that has one; 0 blends colours as they are.
+    /// [`Appearance::colouring`] of the appearance that has one; 0 blends colours unchanged.
     pub fn colouring(&self) -> u32 {
         self.appearances.iter().find_map(|appearance| appearance.colouring()).unwrap_or(0)
     }
 
-    /// [`Appearance::weigh`] of all.
+    /// [`Appearance::weigh`] of all appearances.
     pub fn weigh(&self, step: &mut StepUniform, view: &TrainView) {
         self.appearances.iter().for_each(|appearance| appearance.weigh(step, view));
     }
 
-    /// Records all on the blended picture `image`; returns the picture that each one took, and then the one
-    /// for the loss.
+    /// Records all appearances on the blended picture `image`; returns the input picture of each, and the
+    /// picture for the loss.
     ///
     /// # Errors
-    /// When a kernel does not compile or no room was made.
+    /// When a kernel does not compile or `prepare` was not called.
     pub fn record<'a>(
         &'a self,
         recorder: &mut Recorder<'_>,
@@ -254,7 +254,7 @@ impl Chain {
     /// Records the backward pass of [`Chain::record`], from the loss to the blended picture.
     ///
     /// # Errors
-    /// When a kernel does not compile or no room was made.
+    /// When a kernel does not compile or `prepare` was not called.
     pub fn record_backward(
         &self,
         recorder: &mut Recorder<'_>,
@@ -269,7 +269,7 @@ impl Chain {
         Ok(())
     }
 
-    /// Those whose parameters move with the Gaussians in this iteration.
+    /// The appearances whose parameters step with the Gaussians in this iteration.
     pub fn stepped_with_gaussians(&self, now: &Iteration<'_>) -> Vec<&dyn Appearance> {
         let all = self.appearances.iter().map(AsRef::as_ref);
         all.filter(|appearance| appearance.steps_with_gaussians(now)).collect()
@@ -283,8 +283,8 @@ impl Chain {
 
 /// The pictures of an iteration.
 pub struct Pictures<'a> {
-    /// What each appearance took.
+    /// The input of each appearance.
     taken: Vec<&'a wgpu::Buffer>,
-    /// What the loss compares.
+    /// The picture for the loss.
     pub last: &'a wgpu::Buffer,
 }

@@ -1,12 +1,12 @@
-//! Appearances: what is between Gaussians and picture, or between picture and loss, while a run trains.
+//! Appearances: trainable steps between Gaussians and picture, or between picture and loss.
 //!
-//! An appearance has parameters of its own, which move with the Gaussians. Water is one, and so are the
-//! exposures of the training views. Each has a file here that describes it without a GPU, and a file
+//! An appearance has parameters of its own, which are optimised with the Gaussians. Water is one, and so are
+//! the exposures of the training views. Each has a file here that describes it without a GPU, and a file
 //! `device.rs` that implements [`chain::Appearance`]. [`ALL`] lists them; `docs/internals/appearances.md`
 //! says how to add one.
 //!
-//! What must always hold: nobody outside this folder adds up appearances one by one. Memory forecast,
-//! buffers, recording, checkpoints and the handover of a run ask the list.
+//! Invariant: code outside this folder never enumerates appearances. Memory forecast, buffers, recording,
+//! checkpoints and the handover of a run use the list.
 
 #[cfg(feature = "gpu")]
 pub(crate) mod adam;
@@ -27,31 +27,31 @@ use crate::config::{Composition, TrainConfig, WaterConfig};
 pub const ALL: [Description; 4] =
     [water_gaussians::DESCRIPTION, water_pixels::DESCRIPTION, film::DESCRIPTION, exposure::DESCRIPTION];
 
-/// An appearance as far as no GPU is needed.
+/// An appearance, as far as it needs no GPU.
 #[derive(Clone, Copy)]
 pub struct Description {
     /// Its name, for messages.
     pub name: &'static str,
-    /// Whether a run has it.
+    /// Whether a run uses it.
     pub is_on: fn(Settings<'_>) -> bool,
-    /// Bytes that it takes for a pixel of a training picture, where it is on.
+    /// Its bytes per pixel of a training picture, if it is on.
     pub pixel_bytes: fn(Settings<'_>) -> u64,
-    /// Makes it on the device, where it is on.
+    /// Creates it on the device, if it is on.
     #[cfg(feature = "gpu")]
     start: fn(&chain::Start<'_>) -> Result<Box<dyn chain::Appearance>>,
 }
 
-/// What decides on the appearances of a run.
+/// The settings that select the appearances of a run.
 #[derive(Clone, Copy, Debug)]
 pub struct Settings<'a> {
     /// Optimisation.
     pub train: &'a TrainConfig,
-    /// The water between cameras and scene, where there is one.
+    /// The water between cameras and scene, if there is one.
     pub water: Option<(Composition, &'a WaterConfig)>,
 }
 
 impl<'a> Settings<'a> {
-    /// Those of a configuration that was validated.
+    /// The settings of a validated configuration.
     pub fn new(train: &'a TrainConfig, water: &'a WaterConfig) -> Self {
         let composition = water.composition().ok().flatten();
         Self { train, water: composition.map(|composition| (composition, water)) }
@@ -63,21 +63,20 @@ pub fn of_run(settings: Settings<'_>) -> impl Iterator<Item = Description> {
     ALL.into_iter().filter(move |appearance| (appearance.is_on)(settings))
 }
 
-/// Bytes that all appearances of a run take for a pixel of a training picture.
+/// Bytes per pixel of a training picture, summed over all appearances of a run.
 pub fn pixel_bytes(settings: Settings<'_>) -> u64 {
     of_run(settings).map(|appearance| (appearance.pixel_bytes)(settings)).sum()
 }
 
-/// Bytes of a water on pixels or on Gaussians for a pixel: the picture under water, and its dark channel
-/// where it has one.
+/// Bytes per pixel of a water: the picture under water, and the dark channel if it is used.
 fn water_bytes(settings: Settings<'_>) -> u64 {
     let has_dark_channel = settings.water.is_some_and(|(_, water)| water.has_dark_channel());
     PICTURE_BYTES + if has_dark_channel { DARK_CHANNEL_BYTES } else { 0 }
 }
 
-/// Bytes of a picture that an appearance passes on: a vec4 a pixel.
+/// Bytes per pixel of the picture that an appearance passes on: a vec4.
 const PICTURE_BYTES: u64 = 16;
-/// Bytes of a dark channel for a pixel: its signal, and minima along rows and columns (vec2 each).
+/// Bytes per pixel of a dark channel: its signal, and minima along rows and columns (vec2 each).
 const DARK_CHANNEL_BYTES: u64 = 24;
 
 #[cfg(test)]
@@ -91,7 +90,7 @@ mod tests {
     }
 
     #[test]
-    fn the_configuration_decides_on_the_list() {
+    fn configuration_selects_the_appearances() {
         let JobConfig { mut train, water, .. } = JobConfig::of_preset(Preset::Splatting);
         assert_eq!(named(&train, &water), (vec![], 0));
         train.exposure = true;
@@ -103,7 +102,7 @@ mod tests {
         let water = WaterConfig { medium: Medium::PerGaussian, film, priors, ..WaterConfig::default() };
         assert_eq!(named(&train, &water), (vec!["water on Gaussians", "film"], 16 + 24 + 16));
         let none = WaterConfig { medium: Medium::None, ..water.clone() };
-        assert_eq!(named(&train, &none), (vec![], 0), "without a water there is nothing to embed");
+        assert_eq!(named(&train, &none), (vec![], 0), "view embeddings need a water");
         let impossible = WaterConfig { blend: Blend::OverBlack, ..water };
         assert_eq!(named(&train, &impossible).0, Vec::<&str>::new(), "validation refuses this one");
     }

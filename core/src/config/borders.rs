@@ -109,7 +109,7 @@ mod tests {
     }
 
     #[test]
-    fn the_run_has_lower_rates_and_finds_new_places_only_where_that_is_asked_for() {
+    fn run_has_lower_rates_and_relocates_only_if_enabled() {
         let job = TrainConfig { seed: 7, ..TrainConfig::default() };
         let run = BordersConfig::default().of_run(job.clone());
         assert_eq!((run.iterations, run.max_gaussians, run.seed), (job.iterations, job.max_gaussians, 7));
@@ -130,7 +130,7 @@ mod tests {
     }
 
     #[test]
-    fn values_that_cannot_be_are_named() {
+    fn invalid_values_are_refused_by_name() {
         let borders = BordersConfig {
             enabled: true,
             width: 0.0,

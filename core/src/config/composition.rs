@@ -91,7 +91,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_composition_is_the_one_of_its_keys() {
+    fn every_composition_is_restored_from_its_keys() {
         for composition in Composition::ALL {
             let keys = (composition.medium(), composition.blend());
             assert_eq!(Composition::of(keys.0, keys.1).unwrap(), Some(composition), "{keys:?}");
@@ -99,7 +99,7 @@ mod tests {
     }
 
     #[test]
-    fn the_pair_that_does_not_exist_is_refused() {
+    fn invalid_pair_of_keys_is_refused() {
         for blend in [Blend::Srgb, Blend::Linear, Blend::OverBlack] {
             assert_eq!(Composition::of(Medium::None, blend).unwrap(), None);
         }

@@ -34,14 +34,14 @@ mod tests {
     }
 
     #[test]
-    fn a_grid_and_a_choice_of_grid_contradict_each_other() {
+    fn automatic_partitioning_contradicts_a_grid() {
         assert_eq!(faults(|p| p.auto = true), "");
         assert!(faults(|p| (p.auto, p.columns) = (true, 2)).contains("partition.auto"));
         assert!(faults(|p| (p.auto, p.rows) = (true, 3)).contains("partition.auto"));
     }
 
     #[test]
-    fn memory_that_nothing_fits_and_workers_that_nobody_has_are_refused() {
+    fn impossible_memory_and_too_many_workers_are_refused() {
         for wrong in [-1.0, f64::NAN, f64::INFINITY] {
             assert!(faults(|p| p.memory_gib = wrong).contains("memory_gib"), "{wrong}");
         }

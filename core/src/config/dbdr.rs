@@ -18,7 +18,7 @@ pub enum DbdrMode {
     Maps,
 }
 
-/// RangeModulation of the water between `water.start_at` and `water.freeze_at`.
+/// Training of the water parameters between `water.start_at` and `water.freeze_at`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct DbdrConfig {
@@ -72,7 +72,7 @@ mod tests {
     }
 
     #[test]
-    fn maps_go_with_pixels_only_and_the_presets_are_sound() {
+    fn maps_need_water_on_pixels_and_presets_are_valid() {
         let fault = |config: JobConfig| config.validate().err().map(|error| error.to_string());
         let refused = fault(with(Medium::PerGaussian, DbdrMode::Maps)).unwrap_or_default();
         assert!(refused.contains("water.dbdr.mode") && refused.contains("per_pixel"), "{refused}");
@@ -91,7 +91,7 @@ mod tests {
     }
 
     #[test]
-    fn the_water_descends_where_something_of_it_has_a_rate() {
+    fn water_descends_if_any_part_of_it_has_a_rate() {
         let mut water = JobConfig::default().water;
         assert!(water.descends());
         water.lr = 0.0;

@@ -62,7 +62,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn two_ways_to_learn_the_brightness_of_a_view_are_refused_together() {
+    fn exposures_and_film_are_refused_together() {
         let mut config = JobConfig::of_preset(Preset::Paper);
         assert!(config.water.film.on && config.validate().is_ok());
         config.train.exposure = true;
@@ -73,7 +73,7 @@ mod tests {
     }
 
     #[test]
-    fn values_that_cannot_be_are_named() {
+    fn invalid_values_are_refused_by_name() {
         let mut config = JobConfig::default();
         config.water.film = FilmConfig {
             cell: 4,

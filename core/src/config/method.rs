@@ -54,7 +54,7 @@ mod tests {
     }
 
     #[test]
-    fn an_unknown_method_is_refused_with_those_that_exist() {
+    fn unknown_method_is_refused_with_the_available_ones() {
         let error = JobConfig::from_json(r#"{"method": "fields"}"#).err().map(|error| error.to_string());
         let error = error.unwrap_or_default();
         assert!(error.contains(r#"no method "fields""#) && error.contains(r#""splats""#), "{error}");

@@ -71,7 +71,7 @@ pub struct JobConfig {
     pub water: WaterConfig,
     /// Merging the partitions into one model.
     pub merge: MergeConfig,
-    /// Refinement of partition borders after the merge.
+    /// Border refinement after the merge.
     pub borders: BordersConfig,
     /// Metrics at the borders of cells.
     pub seams: SeamsConfig,

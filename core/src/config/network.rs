@@ -116,7 +116,7 @@ mod tests {
     }
 
     #[test]
-    fn values_that_cannot_be_are_refused_by_name() {
+    fn invalid_values_are_refused_by_name() {
         assert_eq!(faults(|_| ()), "");
         let network = |change: fn(&mut NetworkConfig)| faults(|config| change(&mut config.water.network));
         for (error, name) in [
@@ -142,7 +142,7 @@ mod tests {
     }
 
     #[test]
-    fn what_only_a_network_needs_is_not_asked_of_others() {
+    fn rules_for_a_network_do_not_apply_to_other_priors() {
         let sparse = |config: &mut JobConfig| {
             config.water.prior = WaterPrior::Sparse;
             config.water.network.every = 0;

@@ -24,7 +24,7 @@ mod tests {
     use crate::config::JobConfig;
 
     #[test]
-    fn a_number_that_no_f32_holds_is_refused_by_name_and_the_largest_one_survives_the_store() {
+    fn numbers_beyond_f32_are_refused_and_the_largest_is_stored() {
         for (json, part) in [
             (r#"{"partition": {"extend_edge": 1e308}}"#, "partition.extend_edge is 1e308"),
             (r#"{"train": {"classic": {"gradient": -1e39}}}"#, "train.classic.gradient is -1e39"),

@@ -91,7 +91,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn two_thirds_of_a_run_are_those_before_the_schedule_stops_the_water() {
+    fn free_iterations_end_where_the_schedule_stops_the_water() {
         let config = WaterConfig::default();
         for iterations in [1_u32, 2, 3, 10, 333, 12_000, 9_999_991] {
             let first = config.free_iterations(iterations);
@@ -105,7 +105,7 @@ mod tests {
     }
 
     #[test]
-    fn a_run_of_two_parts_exchanges_once_when_all_of_it_may_be() {
+    fn run_of_two_parts_exchanges_everything_once() {
         let mut config = JobConfig::default();
         assert_eq!(config.exchange_at(1000, 4), None);
         config.partition.neighbours_from = 0.7;
@@ -116,7 +116,7 @@ mod tests {
             [Some(1), Some(1), Some(2)]
         );
         config.water.partitions = WaterPartitions::Joint;
-        assert_eq!(config.exchange_at(1000, 4), Some(700), "the water stays from 667");
+        assert_eq!(config.exchange_at(1000, 4), Some(700), "the water is fixed from 667");
         config.partition.neighbours_from = 0.5;
         assert_eq!(config.exchange_at(1000, 4), Some(667));
         config.partition.neighbours_from = 1.0;
@@ -124,7 +124,7 @@ mod tests {
     }
 
     #[test]
-    fn a_consensus_is_refused_where_the_nine_numbers_are_not_all_that_moves() {
+    fn consensus_needs_the_mode_constants() {
         for (mode, refused) in [(DbdrMode::None, true), (DbdrMode::Constants, false), (DbdrMode::Maps, true)]
         {
             let mut water = WaterConfig { medium: Medium::PerPixel, ..WaterConfig::default() };
@@ -144,7 +144,7 @@ mod tests {
     }
 
     #[test]
-    fn only_partitions_under_water_refine_it() {
+    fn only_several_partitions_under_water_refine_it() {
         let joint = WaterConfig { partitions: WaterPartitions::Joint, ..WaterConfig::default() };
         assert!(joint.is_joint_for(2) && !joint.is_joint_for(1));
         assert!(!WaterConfig { medium: Medium::None, ..joint }.is_joint_for(2));

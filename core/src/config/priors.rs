@@ -110,7 +110,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn weights_are_nothing_before_their_part_of_the_run_and_rise_to_the_whole() {
+    fn weights_are_0_before_their_start_and_then_rise() {
         let paper = PriorsConfig::paper();
         let shares = [0.0, 0.25, 0.275, 0.3, 1.0].map(|progress| paper.share(progress));
         assert_eq!((shares[0], shares[1], shares[3], shares[4]), (0.0, 0.0, 1.0, 1.0));
@@ -121,7 +121,7 @@ mod tests {
     }
 
     #[test]
-    fn a_patch_is_halved_with_the_picture_and_stays_odd() {
+    fn patch_is_halved_with_the_picture_and_stays_odd() {
         let patches = |side: u32| {
             let config = PriorsConfig { dark_channel_patch: side, ..PriorsConfig::default() };
             [0, 1, 2].map(|level| 2 * config.radius(level) + 1)

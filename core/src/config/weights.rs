@@ -21,7 +21,7 @@ pub enum WeightMode {
     Joint,
 }
 
-/// The terms of eq. 5: w = (r + beta) (1 + tau_init log(1 + depth_factor d')) gamma, clamped to 0..`clamp`.
+/// The terms of eq. 5: `w = (r + beta) (1 + tau_init log(1 + depth_factor d')) gamma`, clamped to 0..`clamp`.
 /// d' is the depth of the partition (eq. 6) as a share of that of the deepest one.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -91,7 +91,7 @@ mod tests {
     }
 
     #[test]
-    fn modes_have_their_names() {
+    fn modes_are_stored_by_name() {
         for (mode, name) in [
             (WeightMode::None, "\"none\""),
             (WeightMode::LossFactor, "\"loss_factor\""),
@@ -102,15 +102,15 @@ mod tests {
     }
 
     #[test]
-    fn numbers_that_would_leave_a_partition_with_nothing_are_refused_by_name() {
+    fn terms_that_leave_a_partition_with_nothing_are_refused() {
         assert_eq!(refusals(|_| ()), "");
-        let told = refusals(|p| {
+        let refused = refusals(|p| {
             p.weight_terms =
                 WeightTerms { beta: 0.0, tau_init: -1.0, gamma_edge: f64::NAN, ..p.weight_terms.clone() };
         });
         for name in ["weight_terms.beta", "weight_terms.tau_init", "weight_terms.gamma_edge"] {
-            assert!(told.contains(name), "{name} is missing in {told}");
+            assert!(refused.contains(name), "{name} is missing in {refused}");
         }
-        assert!(!told.contains("gamma_corner"), "{told}");
+        assert!(!refused.contains("gamma_corner"), "{refused}");
     }
 }

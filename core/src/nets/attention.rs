@@ -1,19 +1,17 @@
-//! Layers that weigh channels and pixels: squeeze and excitation, the residual block with it, and the
-//! attention gate.
-//!
-//! As all layers: see `layers`.
+//! Layers that weight channels and pixels: squeeze and excitation, the residual block with it, and the
+//! attention gate. Their interface is that of `layers`.
 
 use super::layers::{Conv, GroupNorm, Image, Linear, Normal, Real, add, relu, relu_backward};
 use super::parameters::Layout;
 use super::products::{dot, sum};
 
-/// Squeeze and excitation (Hu et al. 2018): a gain for each channel from the means of all.
+/// Squeeze and excitation (Hu et al. 2018): a gain for each channel from the means of all channels.
 pub(super) struct SqueezeExcite {
     squeeze: Linear,
     excite: Linear,
 }
 
-/// Input of [`SqueezeExcite`], its means, what the ReLU gave, and the gains.
+/// Input of [`SqueezeExcite`], its means, the output of the ReLU, and the gains.
 pub(super) struct Excited<R> {
     x: Image<R>,
     means: Vec<R>,
@@ -23,8 +21,8 @@ pub(super) struct Excited<R> {
 
 impl SqueezeExcite {
     pub fn new(layout: &mut Layout, channels: usize) -> Self {
-        // A sixteenth as in the release (4 of 64); narrow networks keep 4, since a single unit could die for
-        // good.
+        // A sixteenth, as in the release (4 of 64). Narrow networks keep 4, since a single unit could die
+        // permanently.
         let inner = (channels / 16).max(4);
         let squeeze = Linear::pointwise(layout, channels, inner);
         let excite = Linear::pointwise(layout, inner, channels);
@@ -76,7 +74,7 @@ pub(super) struct SeResidual {
     squeeze_excite: SqueezeExcite,
 }
 
-/// What the layers of a [`SeResidual`] keep; `middle` is what the first ReLU gave.
+/// State that the layers of a [`SeResidual`] keep; `middle` is the output of the first ReLU.
 pub(super) struct Residual<R> {
     pub x: Image<R>,
     normal_1: Normal<R>,
@@ -106,7 +104,7 @@ impl SeResidual {
         (y, Residual { x, normal_1, middle, normal_2, excited })
     }
 
-    /// `y` is what `forward` gave.
+    /// `y` is the output of `forward`.
     pub fn backward<R: Real>(
         &self,
         weights: &[R],
@@ -127,15 +125,14 @@ impl SeResidual {
     }
 }
 
-/// Additive attention gate (Oktay et al. 2018): a gain for each pixel of `skip` from `gating` and `skip`
-/// together.
+/// Additive attention gate (Oktay et al. 2018): a gain for each pixel of `skip`, from `gating` and `skip`.
 pub(super) struct AttentionGate {
     pub gating: Conv,
     pub skip: Conv,
     pub psi: Conv,
 }
 
-/// What the ReLU of an [`AttentionGate`] gave, and the gains [1,H,W].
+/// Output of the ReLU of an [`AttentionGate`], and the gains [1,H,W].
 pub(super) struct Gated<R> {
     joint: Image<R>,
     gains: Image<R>,
@@ -170,7 +167,7 @@ impl AttentionGate {
         (y, Gated { joint, gains })
     }
 
-    /// The gradients by `gating` and by `skip`.
+    /// Returns the gradients of `gating` and of `skip`.
     pub fn backward<R: Real>(
         &self,
         weights: &[R],
@@ -206,7 +203,7 @@ fn sigmoid<R: Real>(x: R) -> R {
     R::of(1.0) / (R::of(1.0) + (-x).exp())
 }
 
-/// The derivative of a sigmoid where its value is `y`.
+/// The derivative of a sigmoid at the point where its value is `y`.
 fn sigmoid_slope<R: Real>(y: R) -> R {
     y * (R::of(1.0) - y)
 }

@@ -1,18 +1,18 @@
-//! What a network sees of a view: ranges, small, in units of the scene, with 0 where there is nothing.
+//! The input of a network for a view: a small range image in units of the scene scale, with 0 where nothing
+//! is seen.
 
 use crate::{CoreError, Result};
 
-/// Farthest range in a depth map, in units of the scene. At 16 times the usual viewing distance no light of
-/// the scene is left in any water worth the name, and one far cell among near ones would drown these in the
-/// normalisation.
+/// Largest range in a depth map, in scene scales. At 16 scene scales, no light of the scene is left in any
+/// real water. A single far cell would also dominate the near ones in the normalisation.
 pub const MAX_RANGE: f32 = 16.0;
-/// Alpha below which a pixel counts as open water, as where the image formation divides by alpha.
+/// Alpha below which a pixel counts as open water; the image formation uses the same limit to divide by
+/// alpha.
 const MIN_ALPHA: f32 = 1e-3;
 
-/// A range image for a network, sound by construction: every value is a number from 0 to [`MAX_RANGE`].
+/// A range image for a network, valid by construction: every value is a number from 0 to [`MAX_RANGE`].
 ///
-/// In units of the scene (the length that `Water::to_raw` takes as well), row-major, 0 where there is
-/// nothing.
+/// In scene scales (the unit of `Water::to_raw`), row-major, 0 where nothing is seen.
 #[derive(Clone, Debug, PartialEq)]
 pub struct DepthMap {
     width: u32,
@@ -35,11 +35,12 @@ pub struct RangeImage<'a> {
 }
 
 impl DepthMap {
-    /// A depth map of `width` x `height` values. What is no range (NaN, infinite, below 0) becomes 0 and is
-    /// counted in [`DepthMap::unusable`]; what is farther than [`MAX_RANGE`] is cut off there.
+    /// A depth map of `width` x `height` values. Invalid ranges (NaN, infinite, negative) become 0 and are
+    /// counted in [`DepthMap::unusable`]; ranges above [`MAX_RANGE`] are clipped.
     ///
     /// # Errors
-    /// [`CoreError::Network`] when a side is no multiple of 4 or below 16, or `values` has another length.
+    /// [`CoreError::Network`] when a side is not a multiple of 4 or is below 16, or `values` has another
+    /// length.
     pub fn new(width: u32, height: u32, mut values: Vec<f32>) -> Result<Self> {
         check_size(width, height)?;
         if values.len() != width as usize * height as usize {
@@ -57,13 +58,14 @@ impl DepthMap {
         Ok(Self { width, height, values, unusable })
     }
 
-    /// The depth map of a render: in each cell the mean range over its covered area, weighted by alpha, over
-    /// `unit` (scene units). Cells with nothing in them are 0. Pixels without a usable range or alpha count
-    /// as not covered and in [`DepthMap::unusable`]. The whole picture is taken, whatever the ratio of its
-    /// sides.
+    /// The depth map of a render: each cell is the mean range over its covered area, weighted by alpha and
+    /// divided by `unit` (scene units). Empty cells are 0. Pixels without a valid range or alpha count as not
+    /// covered, and are counted in [`DepthMap::unusable`]. The whole picture is used, whatever its aspect
+    /// ratio.
     ///
     /// # Errors
-    /// [`CoreError::Network`] when a size does not fit (as [`DepthMap::new`]), or `unit` is no length.
+    /// [`CoreError::Network`] when a size is invalid (as in [`DepthMap::new`]), or `unit` is not a positive
+    /// length.
     pub fn from_render(image: &RangeImage, width: u32, height: u32, unit: f32) -> Result<Self> {
         check_size(width, height)?;
         image.check(unit)?;
@@ -74,8 +76,8 @@ impl DepthMap {
         Ok(Self { width, height, values, unusable })
     }
 
-    /// Backward of [`DepthMap::from_render`]: the gradients with respect to `image.ranges` and `image.alphas`
-    /// from `v_depth`, that with respect to the values of the depth map of `width` x `height`.
+    /// Backward pass of [`DepthMap::from_render`]: the gradients with respect to `image.ranges` and
+    /// `image.alphas`, from the gradient `v_depth` of the depth map of `width` x `height`.
     ///
     /// # Errors
     /// As [`DepthMap::from_render`], and when `v_depth` has another length.
@@ -100,7 +102,7 @@ impl DepthMap {
         image.for_each_overlap(width, height, |cell, pixel, area| {
             let (sum, v) = (&sums[cell], f64::from(v_depth[cell]));
             let mean = sum.mean(unit);
-            // 0 and MAX_RANGE are where the forward pass is flat.
+            // The forward pass is constant at 0 and at MAX_RANGE.
             if mean > 0.0 && mean < MAX_RANGE {
                 let v_sum = v * area / sum.alpha;
                 v_ranges[pixel] += (v_sum / f64::from(unit)) as f32;
@@ -120,24 +122,23 @@ impl DepthMap {
         self.height
     }
 
-    /// Ranges in units of the scene, row-major, 0 where there is nothing.
+    /// Ranges in scene scales, row-major, 0 where nothing is seen.
     pub fn values(&self) -> &[f32] {
         &self.values
     }
 
-    /// How many values, or pixels of the render, were not ranges. Not 0 means that something before this is
-    /// broken.
+    /// Number of values, or pixels of the render, that were not valid ranges. Not 0 indicates a fault in an
+    /// earlier stage.
     pub fn unusable(&self) -> usize {
         self.unusable
     }
 
-    /// Share of the map that has a range. At 0 a network learns nothing from it but its biases.
+    /// Share of the map with a range. At 0, a network learns nothing but its biases.
     pub fn coverage(&self) -> f32 {
         self.values.iter().filter(|value| **value > 0.0).count() as f32 / self.values.len() as f32
     }
 
-    /// Whether a value is neither "nothing" nor cut off, so that a gradient with respect to it means
-    /// something.
+    /// Whether a value is neither empty nor clipped, so that it has a gradient.
     pub(super) fn is_live(value: f32) -> bool {
         value > 0.0 && value < MAX_RANGE
     }
@@ -156,7 +157,9 @@ impl RangeImage<'_> {
             )));
         }
         if !(unit > 0.0 && unit.is_finite()) {
-            return Err(CoreError::Network(format!("the unit of the scene is {unit}, which is no length")));
+            return Err(CoreError::Network(format!(
+                "the scene scale is {unit}; it must be finite and above 0"
+            )));
         }
         Ok(())
     }
@@ -191,7 +194,8 @@ impl RangeImage<'_> {
     }
 }
 
-/// Sums over the covered area of a cell: of alpha T range (scene units) and of alpha, both times pixels.
+/// Sums over the covered area of a cell, weighted by area in pixels: of alpha T range (scene units) and of
+/// alpha.
 #[derive(Clone, Copy, Default)]
 struct CellSum {
     range: f64,
@@ -199,7 +203,7 @@ struct CellSum {
 }
 
 impl CellSum {
-    /// Mean range in units of `unit`, 0 where nothing is covered.
+    /// Mean range in units of `unit`; 0 if nothing is covered.
     fn mean(self, unit: f32) -> f32 {
         if self.alpha > 0.0 { (self.range / (self.alpha * f64::from(unit))) as f32 } else { 0.0 }
     }
@@ -209,9 +213,10 @@ fn is_usable(range: f32, alpha: f32) -> bool {
     range.is_finite() && range >= 0.0 && (0.0..=1.0 + 1e-3).contains(&alpha)
 }
 
-/// Pixels of `pixels` that overlap cell `cell` of `cells` along one axis, each with its overlap in pixels.
+/// The pixels of `pixels` that overlap cell `cell` of `cells` along one axis, each with its overlap in
+/// pixels.
 fn overlaps(cell: u32, cells: u32, pixels: u32) -> impl Iterator<Item = (u32, f64)> {
-    // In units of 1/cells of a pixel all borders are integers, so no border is missed by rounding.
+    // In units of 1/cells of a pixel, all boundaries are integers, so rounding cannot miss one.
     let (pixels, cells) = (u64::from(pixels), u64::from(cells));
     let (first, end) = (u64::from(cell) * pixels, (u64::from(cell) + 1) * pixels);
     (first / cells..end.div_ceil(cells)).map(move |pixel| {
@@ -226,7 +231,7 @@ fn check_size(width: u32, height: u32) -> Result<()> {
         return Ok(());
     }
     Err(CoreError::Network(format!(
-        "a depth map of {width} x {height} does not fit: both sides have to be multiples of 4, of at least 16"
+        "a depth map of {width} x {height} is not possible: both sides must be multiples of 4, at least 16"
     )))
 }
 
@@ -236,7 +241,8 @@ mod tests {
     use super::*;
     use crate::rng::{Stream, uniform_at};
 
-    /// A render with nothing at the top, holes, faint pixels, every range different and some beyond all.
+    /// A render with an empty top, holes, faint pixels, different ranges everywhere and some beyond the
+    /// limit.
     fn render(width: u32, height: u32) -> (Vec<f32>, Vec<f32>) {
         let random = |a, b| uniform_at(11, Stream::Test, a, b);
         let alphas: Vec<f32> = (0..width * height)
@@ -247,7 +253,7 @@ mod tests {
                 u => u,
             })
             .collect();
-        // The columns at the right are far away.
+        // The rightmost columns are far away.
         let far = |i: u32| if i % width + 4 > width { 40.0 } else { 0.0 };
         let ranges =
             alphas.iter().zip(0..).map(|(alpha, i)| alpha * (2.0 + 4.0 * random(1, i) + far(i))).collect();
@@ -256,7 +262,7 @@ mod tests {
 
     #[test]
     fn a_cell_is_the_mean_over_its_covered_area() {
-        // Left half at 3 scene units with alpha 1, right half at 8 with alpha 0.5, below it nothing; a unit
+        // Left half at 3 scene units with alpha 1, right half at 8 with alpha 0.5, nothing below; the unit
         // is 2.
         let (width, height) = (40, 48);
         let near = |i: u32| i % width < width / 2;
@@ -284,7 +290,7 @@ mod tests {
     }
 
     #[test]
-    fn cells_share_pixels_by_area_whatever_the_sizes() {
+    fn cells_share_pixels_by_area_at_any_size() {
         for (pixels, cells) in [(37, 16), (16, 16), (15, 20), (1, 16), (1000, 96)] {
             let mut seen = vec![0.0; pixels as usize];
             for cell in 0..cells {
@@ -317,7 +323,7 @@ mod tests {
         let depth = DepthMap::from_render(&image, 16, 16, unit).unwrap();
         assert!(
             depth.values().contains(&MAX_RANGE) && depth.values().contains(&0.0),
-            "flat parts are covered"
+            "constant parts are covered"
         );
         let (v_ranges, v_alphas) = DepthMap::render_gradient(&image, 16, 16, unit, &v_depth).unwrap();
         let mut compared = 0;
@@ -334,8 +340,8 @@ mod tests {
                 };
                 let ((up, wide), (down, back)) = (at(h), at(-h));
                 let numeric = (up - down) / (wide - back);
-                // The values are f32 near 10, so a difference is known to about 1e-6 / 1e-2; curvature adds
-                // h^2.
+                // The values are f32 near 10, so a difference is accurate to about 1e-6 / 1e-2; curvature
+                // adds h^2.
                 let tolerance = 2e-3 * (1.0 + numeric.abs());
                 let error = (f64::from(analytic) - numeric).abs();
                 assert!(error < tolerance, "pixel {pixel} {by_alpha}: {analytic} {numeric}");
@@ -346,7 +352,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_range_is_left_out_and_counted() {
+    fn invalid_ranges_are_ignored_and_counted() {
         let mut values = vec![1.0; 256];
         values[..5].copy_from_slice(&[f32::NAN, f32::INFINITY, -1.0, 0.0, 1e30]);
         let depth = DepthMap::new(16, 16, values).unwrap();
@@ -358,22 +364,19 @@ mod tests {
         let image = RangeImage { width: 32, height: 32, ranges: &ranges, alphas: &alphas };
         let depth = DepthMap::from_render(&image, 16, 16, 1.0).unwrap();
         assert_eq!(depth.unusable(), 4);
-        assert!(
-            depth.values().iter().all(|value| *value == 2.0),
-            "the other pixels of a cell are what counts"
-        );
+        assert!(depth.values().iter().all(|value| *value == 2.0), "the other pixels of a cell count");
     }
 
     #[test]
-    fn sizes_that_do_not_fit_are_refused() {
-        let said = |result: Result<DepthMap>| result.unwrap_err().to_string();
-        assert!(said(DepthMap::new(18, 16, vec![0.0; 18 * 16])).contains("18 x 16"));
-        assert!(said(DepthMap::new(16, 12, vec![0.0; 16 * 12])).contains("multiples of 4"));
-        assert!(said(DepthMap::new(16, 16, vec![0.0; 255])).contains("255 values"));
+    fn invalid_sizes_are_refused() {
+        let refused = |result: Result<DepthMap>| result.unwrap_err().to_string();
+        assert!(refused(DepthMap::new(18, 16, vec![0.0; 18 * 16])).contains("18 x 16"));
+        assert!(refused(DepthMap::new(16, 12, vec![0.0; 16 * 12])).contains("multiples of 4"));
+        assert!(refused(DepthMap::new(16, 16, vec![0.0; 255])).contains("255 values"));
         let image = RangeImage { width: 4, height: 4, ranges: &[0.0; 16], alphas: &[0.0; 15] };
-        assert!(said(DepthMap::from_render(&image, 16, 16, 1.0)).contains("15 alphas"));
+        assert!(refused(DepthMap::from_render(&image, 16, 16, 1.0)).contains("15 alphas"));
         let image = RangeImage { width: 4, height: 4, ranges: &[0.0; 16], alphas: &[0.0; 16] };
-        assert!(said(DepthMap::from_render(&image, 16, 16, 0.0)).contains("no length"));
+        assert!(refused(DepthMap::from_render(&image, 16, 16, 0.0)).contains("finite and above 0"));
         assert_eq!(DepthMap::from_render(&image, 16, 16, 1.0).unwrap().coverage(), 0.0);
     }
 }

@@ -1,34 +1,35 @@
-//! Layers of the networks, each a pass forward and one backward. All images are [C,H,W].
+//! Layers of the networks, each with a forward and a backward pass. All images are [C,H,W].
 //!
 //! A layer knows the places of its weights; all functions take the weights of the whole network. `forward`
-//! gives the output, and where its input and output do not suffice for the way back, what does. `backward`
-//! takes the gradient by the output (`v_y`), gives that by the input and adds those by the weights to
-//! `v_weights`, which lie as the weights.
+//! returns the output and, if its input and output are not enough for the backward pass, the missing state.
+//! `backward` takes the gradient of the output (`v_y`) and returns that of the input. It adds the gradients
+//! of the weights to `v_weights`, which has the layout of the weights.
 //!
-//! No number that is not finite may get lost on the way: a ReLU or a maximum that made 0 of NaN would hide
-//! that the network has diverged.
+//! Non-finite values must propagate: a ReLU or a maximum that turned NaN into 0 would hide that the network
+//! has diverged.
 
 use super::parameters::{Init, Layout, Place};
 pub(super) use super::products::{Image, Real};
 use super::products::{Lines, add_scaled, correlate, dot, sum, weight_gradient};
 
-/// Groups of a normalisation. Few, so that much of what channels say by their sizes stays.
+/// Number of groups of a normalisation. Few, so that most of the information in the magnitudes of channels
+/// remains.
 pub(super) const GROUPS: usize = 4;
-/// Added to the variance, as usual.
+/// Added to the variance; the usual value.
 pub(super) const VARIANCE_FLOOR: f64 = 1e-5;
 
-/// Kaiming's deviation by fan-out, for what a ReLU follows (He et al. 2015, eq. 14).
+/// Kaiming's standard deviation by fan-out, for layers before a ReLU (He et al. 2015, eq. 14).
 fn kaiming(fan_out: usize) -> Init {
     Init::Normal((2.0 / fan_out as f64).sqrt())
 }
 
-/// The usual bias: uniform within 1 / sqrt(fan-in). Not 0: without it the first layer and its normalisation
-/// could not tell a scene from the same scene twice as far away.
+/// The usual bias: uniform within 1 / sqrt(fan-in). Not 0: without it, the first layer and its normalisation
+/// could not distinguish a scene from the same scene at twice the distance.
 fn bias(fan_in: usize) -> Init {
     Init::Uniform(1.0 / (fan_in as f64).sqrt())
 }
 
-/// Convolution, 1x1 or 3x3 with a border of zeros; `kernel` is odd.
+/// Convolution, 1x1 or 3x3 with a zero border; `kernel` is odd.
 pub(super) struct Conv {
     /// [out, kernel, kernel, in].
     pub weight: Place,
@@ -60,7 +61,7 @@ impl Conv {
         add_sums(v_y, self.bias.of_mut(v_weights));
         let v_y = Lines::new(v_y, self.kernel);
         weight_gradient(&Lines::new(x, self.kernel), &v_y, self.weight.of_mut(v_weights));
-        // An input counts for the outputs around it by the weights of the opposite taps.
+        // An input contributes to the outputs around it with the weights of the opposite taps.
         let taps = self.kernel * self.kernel;
         let weight = self.weight.of(weights);
         let mut turned = Vec::with_capacity(weight.len());
@@ -73,9 +74,9 @@ impl Conv {
     }
 }
 
-/// Mean over all pixels of a convolution of 3x3, at a fraction of its cost: a convolution is linear, so that
-/// its mean is the kernel times the means of the nine shifted windows of its input, whose sides are 2 pixels
-/// at least.
+/// Mean over all pixels of a 3x3 convolution, at a fraction of its cost. A convolution is linear, so its mean
+/// is the kernel applied to the means of the nine shifted windows of its input. The input must be at least 2
+/// x 2 pixels.
 pub(super) struct MeanConv(pub Conv);
 
 /// The size of the input of a [`MeanConv`], and the means of its windows, [3, 3, in].
@@ -94,7 +95,7 @@ impl MeanConv {
         let pixels = R::of(x.pixels() as f64);
         let mut means = vec![R::default(); 9 * x.channels];
         for (channel, plane) in x.planes().enumerate() {
-            // Of each row: the sum without its last pixel, of all, and without the first.
+            // Per row: the sum without its last pixel, of all pixels, and without its first.
             let mut rows = [R::default(); 3];
             let (mut first, mut last) = (rows, rows);
             for (y, row) in plane.chunks_exact(x.width).enumerate() {
@@ -136,7 +137,7 @@ impl MeanConv {
         for (channel, plane) in v_x.planes_mut().enumerate() {
             let v_window = |ky: usize, kx: usize| v_means[(ky * 3 + kx) * channels + channel] / pixels;
             for (y, row) in plane.chunks_exact_mut(*width).enumerate() {
-                // The windows of the upper taps leave out the last row, those of the lower taps the first.
+                // The windows of the upper taps omit the last row, those of the lower taps the first.
                 let mut by_column = [R::default(); 3];
                 for ky in (0..3).filter(|ky| (*ky < 2 || y > 0) && (*ky > 0 || y + 1 < *height)) {
                     (0..3).for_each(|kx| by_column[kx] += v_window(ky, kx));
@@ -151,8 +152,8 @@ impl MeanConv {
     }
 }
 
-/// Transposed convolution of 2x2 with stride 2: twice the size. Its 2x2 do not overlap, so it is a
-/// convolution of 1x1 with four times the outputs, which then move apart.
+/// Transposed 2x2 convolution with stride 2, which doubles the size. Its 2x2 outputs do not overlap. It is
+/// therefore a 1x1 convolution with four times the outputs, which are then interleaved.
 pub(super) struct UpConv {
     /// [out, 2, 2, in].
     pub weight: Place,
@@ -194,7 +195,7 @@ impl UpConv {
         correlate(&v_parts, &turned, &vec![R::default(); self.from])
     }
 
-    /// Calls `visit(part, pixel)` with the place of each output in [out, y, x, H, W] and in the image [out,
+    /// Calls `visit(part, pixel)` with the index of each output in [out, y, x, H, W] and in the image [out,
     /// 2H, 2W].
     fn each_part<R: Real>(&self, x: &Image<R>, mut visit: impl FnMut(usize, usize)) {
         let mut pixel = 0;
@@ -224,12 +225,12 @@ impl Linear {
         Self { weight, bias }
     }
 
-    /// A 1x1 convolution on a single pixel, with the first values of one.
+    /// A 1x1 convolution on a single pixel, with the same initial values.
     pub fn pointwise(layout: &mut Layout, from: usize, to: usize) -> Self {
         Self::new(layout, from, to, kaiming(to), bias(from))
     }
 
-    /// Xavier's deviation times `gain` (Glorot and Bengio 2010).
+    /// Xavier's standard deviation times `gain` (Glorot and Bengio 2010).
     pub fn xavier(layout: &mut Layout, from: usize, to: usize, gain: f64) -> Self {
         let weight = Init::Normal(gain * (2.0 / (from + to) as f64).sqrt());
         Self::new(layout, from, to, weight, bias(from))
@@ -253,15 +254,15 @@ impl Linear {
 
 /// Group normalisation (Wu and He 2018), in place of the batch normalisation of the release.
 ///
-/// A batch here is one view. Statistics over a batch of one are those of the image itself while training, and
-/// running means of other images when the network is asked for its prediction: training and prediction would
-/// disagree. Group normalisation has no state and is the same in both.
+/// A batch here is one view. With a batch of one, batch normalisation would train with the statistics of the
+/// image itself, but predict with running means of other images. Training and prediction would then disagree.
+/// Group normalisation has no state and is the same in both.
 pub(super) struct GroupNorm {
     pub scale: Place,
     pub shift: Place,
 }
 
-/// What [`GroupNorm`] makes before scale and shift, and 1 / deviation of each group.
+/// Output of [`GroupNorm`] before scale and shift, and 1 / deviation of each group.
 pub(super) struct Normal<R> {
     image: Image<R>,
     inverses: [R; GROUPS],
@@ -306,7 +307,7 @@ impl GroupNorm {
             *v_scale += dot(v_plane, plane);
             v_plane.iter_mut().for_each(|v| *v = *v * *scale);
         }
-        // Mean and deviation move with every value: neither a shift nor a factor of a group counts.
+        // Mean and deviation depend on every value, so the shift and scale components of a group are removed.
         let count = v_y.values.len() / GROUPS;
         let n = R::of(count as f64);
         let groups = v_y.values.chunks_exact_mut(count).zip(normal.image.values.chunks_exact(count));
@@ -320,7 +321,7 @@ impl GroupNorm {
     }
 }
 
-/// Largest of each 2x2, and where in its channel each was: the first of equals.
+/// The largest value of each 2x2 block and its index in the channel; the first of equal values.
 pub(super) fn halve<R: Real>(x: &Image<R>) -> (Image<R>, Vec<usize>) {
     let mut y = Image::zeros(x.channels, x.height / 2, x.width / 2);
     let mut places = Vec::with_capacity(y.values.len());
@@ -329,7 +330,7 @@ pub(super) fn halve<R: Real>(x: &Image<R>) -> (Image<R>, Vec<usize>) {
             let corner = at / (x.width / 2) * 2 * x.width + at % (x.width / 2) * 2;
             let mut largest = corner;
             for place in [corner + 1, corner + x.width, corner + x.width + 1] {
-                // Not `>` alone: NaN has to come through.
+                // Not `>` alone: NaN must propagate.
                 if plane[place] > plane[largest] || is_nan(plane[place]) {
                     largest = place;
                 }
@@ -341,7 +342,7 @@ pub(super) fn halve<R: Real>(x: &Image<R>) -> (Image<R>, Vec<usize>) {
     (y, places)
 }
 
-/// The gradient by the `x` of [`halve`], of `height` x `width`.
+/// The gradient of the `x` of [`halve`], of `height` x `width`.
 pub(super) fn halve_backward<R: Real>(
     places: &[usize],
     v_y: &Image<R>,
@@ -361,14 +362,14 @@ pub(super) fn halve_backward<R: Real>(
 /// max(x, 0) in place.
 pub(super) fn relu<R: Real>(values: &mut [R]) {
     for value in values {
-        // Not a maximum: NaN has to come through.
+        // Not a maximum: NaN must propagate.
         if *value < R::default() {
             *value = R::default();
         }
     }
 }
 
-/// From the gradient by what [`relu`] gave, in `v`, to that by what it took.
+/// Turns the gradient `v` of the output of [`relu`], `values`, into that of its input.
 pub(super) fn relu_backward<R: Real>(values: &[R], v: &mut [R]) {
     for (v, value) in v.iter_mut().zip(values) {
         if *value <= R::default() {
@@ -388,7 +389,7 @@ pub(super) fn add<R: Real>(to: &mut [R], from: &[R]) {
     }
 }
 
-/// Adds the products of each of `rows` with all of `columns` to `to` [rows, columns].
+/// Adds the outer product of `rows` and `columns` to `to` [rows, columns].
 fn add_outer<R: Real>(to: &mut [R], rows: &[R], columns: &[R]) {
     for (to, row) in to.chunks_exact_mut(columns.len()).zip(rows) {
         add_scaled(to, *row, columns);

@@ -1,14 +1,14 @@
-//! Weights of a network as plain arrays, with their first values, Adam, and their bytes.
+//! Weights of a network as plain arrays: initial values, Adam, and serialisation.
 
 use crate::rng::{Stream, random_bits};
 use crate::{CoreError, Result};
 
-/// Adam (Kingma and Ba 2015), with the values of the paper.
+/// Adam (Kingma and Ba 2015), with the constants of the paper.
 const BETA_1: f64 = 0.9;
 const BETA_2: f64 = 0.999;
 const EPSILON: f64 = 1e-8;
-/// Largest gradient that Adam takes: its square over 1 - beta_2 still is an f32. A larger one counts as not
-/// finite.
+/// Largest gradient that Adam accepts: its square divided by 1 - beta_2 still fits an f32. A larger one
+/// counts as not finite.
 const MAX_GRADIENT: f32 = 1e15;
 
 const MAGIC: &[u8; 8] = b"fathomwp";
@@ -16,19 +16,19 @@ const FORMAT: u32 = 1;
 const HEADER: usize = 8 + 3 * 4;
 const DIGEST: usize = 32;
 
-/// First values of a weight array.
+/// Initial values of a weight array.
 pub(super) enum Init {
-    /// One number.
+    /// One value for all.
     Constant(f32),
     /// Uniform in -bound..bound.
     Uniform(f64),
-    /// Normal with mean 0 and this deviation.
+    /// Normal with mean 0 and this standard deviation.
     Normal(f64),
-    /// These.
+    /// Explicit values.
     Values(Vec<f32>),
 }
 
-/// Place of a weight array among all weights of its network, which lie one after the other.
+/// Place of a weight array among all weights of its network, which are contiguous.
 #[derive(Clone, Copy)]
 pub(super) struct Place {
     start: usize,
@@ -36,24 +36,24 @@ pub(super) struct Place {
 }
 
 impl Place {
-    /// How many weights the array has.
+    /// Number of weights in the array.
     #[cfg(test)]
     pub fn length(self) -> usize {
         self.length
     }
 
-    /// This array of all `weights`, or its part of their gradient.
+    /// This array in all `weights`, or in their gradient.
     pub fn of<R>(self, weights: &[R]) -> &[R] {
         &weights[self.start..self.start + self.length]
     }
 
-    /// As [`Place::of`].
+    /// Mutable version of [`Place::of`].
     pub fn of_mut<R>(self, weights: &mut [R]) -> &mut [R] {
         &mut weights[self.start..self.start + self.length]
     }
 }
 
-/// The weight arrays of a network while its layers are laid out.
+/// Collects the weight arrays of a network while its layers are created.
 #[derive(Default)]
 pub(super) struct Layout {
     arrays: Vec<(Place, Init)>,
@@ -61,7 +61,7 @@ pub(super) struct Layout {
 }
 
 impl Layout {
-    /// One more array of `length`.
+    /// Adds an array of `length`.
     pub fn add(&mut self, length: usize, init: Init) -> Place {
         let place = Place { start: self.weights, length };
         self.arrays.push((place, init));
@@ -69,14 +69,14 @@ impl Layout {
         place
     }
 
-    /// The arrays, in their order.
+    /// The arrays in order.
     #[cfg(test)]
     pub fn places(&self) -> Vec<Place> {
         self.arrays.iter().map(|(place, _)| *place).collect()
     }
 }
 
-/// Weights of a network and the state of its Adam.
+/// Weights of a network and its Adam state.
 pub(super) struct Parameters {
     values: Vec<f32>,
     first_moments: Vec<f32>,
@@ -85,7 +85,7 @@ pub(super) struct Parameters {
 }
 
 impl Parameters {
-    /// First values, each a function of (seed, array, element) alone.
+    /// Initial values; each depends only on seed, array and element.
     pub fn new(layout: Layout, seed: u32) -> Self {
         let mut values = Vec::with_capacity(layout.weights);
         for ((Place { length, .. }, init), array) in layout.arrays.into_iter().zip(0..) {
@@ -113,8 +113,8 @@ impl Parameters {
         &self.values
     }
 
-    /// One step of Adam; whether it was taken. Where a number of `gradient` is not finite, nothing changes:
-    /// Adam would carry it on in the moments for good.
+    /// One step of Adam; returns whether it was taken. A non-finite value in `gradient` changes nothing: it
+    /// would stay in Adam's moments forever.
     pub fn step(&mut self, gradient: &[f32], learning_rate: f32) -> bool {
         if gradient.len() != self.values.len() || !gradient.iter().all(|g| g.abs() < MAX_GRADIENT) {
             return false;
@@ -133,8 +133,8 @@ impl Parameters {
         true
     }
 
-    /// Little-endian: magic, format, `shape` of the network, steps, values, both moments, BLAKE3 of all
-    /// before.
+    /// Little-endian: magic, format, `shape` of the network, steps, values, both moments, BLAKE3 of
+    /// everything before.
     pub fn to_bytes(&self, shape: u32) -> Vec<u8> {
         let mut bytes = Vec::with_capacity(HEADER + 12 * self.values.len() + DIGEST);
         bytes.extend_from_slice(MAGIC);
@@ -149,7 +149,7 @@ impl Parameters {
         bytes
     }
 
-    /// Takes what [`Parameters::to_bytes`] gave for the same `shape`; on an error nothing has changed.
+    /// Restores the result of [`Parameters::to_bytes`] for the same `shape`; nothing changes on an error.
     pub fn restore(&mut self, bytes: &[u8], shape: u32) -> Result<()> {
         let refuse = |why: String| Err(CoreError::Checkpoint(format!("the state of a network: {why}")));
         let Some((content, digest)) = bytes
@@ -185,7 +185,7 @@ impl Parameters {
     }
 }
 
-/// Uniform in (0, 1), in the middles of 2^32 steps.
+/// Uniform in (0, 1), at the centres of 2^32 intervals.
 fn unit(bits: u32) -> f64 {
     (f64::from(bits) + 0.5) / 4_294_967_296.0
 }
@@ -199,7 +199,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn first_values_have_the_deviation_that_was_asked_for() {
+    fn initial_values_have_the_requested_deviation() {
         let mut layout = Layout::default();
         let n = 100_000;
         for init in [Init::Normal(0.5), Init::Uniform(0.5), Init::Constant(3.0)] {
@@ -221,13 +221,13 @@ mod tests {
     }
 
     #[test]
-    fn a_step_is_the_step_of_the_paper_of_adam() {
+    fn step_matches_the_adam_paper() {
         let mut layout = Layout::default();
         layout.add(2, Init::Constant(1.0));
         let mut parameters = Parameters::new(layout, 0);
-        // The first step is the learning rate against the sign; the second, with the opposite gradient g2 =
-        // -g1 / 2: m = (0.9 * 0.1 - 0.1 * 0.5) g1 / (1 - 0.81), v = (0.999 * 0.001 + 0.001 * 0.25) g1^2 /
-        // (1 - 0.999^2).
+        // The first step has the size of the learning rate, against the sign of the gradient. The second has
+        // the opposite gradient g2 = -g1 / 2: m = (0.9 * 0.1 - 0.1 * 0.5) g1 / (1 - 0.81), v = (0.999 *
+        // 0.001 + 0.001 * 0.25) g1^2 / (1 - 0.999^2).
         assert!(parameters.step(&[2.0, -4.0], 0.1));
         assert!((parameters.values()[0] - 0.9).abs() < 1e-6 && (parameters.values()[1] - 1.1).abs() < 1e-6);
         assert!(parameters.step(&[-1.0, 2.0], 0.1));
@@ -236,7 +236,7 @@ mod tests {
     }
 
     #[test]
-    fn a_gradient_that_is_not_finite_changes_nothing() {
+    fn non_finite_gradient_changes_nothing() {
         let mut layout = Layout::default();
         layout.add(2, Init::Constant(1.0));
         let mut parameters = Parameters::new(layout, 0);

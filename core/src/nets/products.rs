@@ -1,19 +1,19 @@
 //! Sums of products: the whole cost of a convolution, forward and backward.
 //!
-//! An image with a border of zeros lies as one line of numbers a channel ([`Lines`]), so that what a tap of a
-//! kernel reads is a line shifted by a constant. Then the convolution and its gradient by its input are sums
-//! of shifted lines, each times a weight ([`correlate`]). With the channels of a pixel beside each other the
-//! gradient by the weights is such a sum too: of what the taps read for each pixel, times the gradient by
-//! that pixel ([`weight_gradient`]). Nothing is copied once a tap, and one inner loop serves for all.
+//! An image with a zero border is stored as one line of values per channel ([`Lines`]). A tap of a kernel
+//! then reads that line, shifted by a constant. The convolution and its input gradient are thus sums of
+//! shifted lines, each times a weight ([`correlate`]). The weight gradient has the same form if the channels
+//! of a pixel are adjacent. It sums the values that the taps read for each pixel, times the gradient of that
+//! pixel ([`weight_gradient`]). Nothing is copied per tap, and one inner loop serves all of these.
 //!
-//! Every sum is made by one thread in an order that the code fixes. So the bytes depend neither on the number
-//! of threads nor on the width of the vectors.
+//! Every sum is computed by one thread in an order fixed by the code. The bytes therefore depend neither on
+//! the number of threads nor on the width of the vectors.
 
 use std::ops::{Add, AddAssign, Div, Mul, Neg, Sub, SubAssign};
 
 use rayon::prelude::*;
 
-/// A float: f32 for training, f64 where tests compare with central differences.
+/// A float: f32 for training, f64 for tests against central differences.
 pub(super) trait Real:
     Copy
     + std::fmt::Debug
@@ -29,9 +29,9 @@ pub(super) trait Real:
     + AddAssign
     + SubAssign
 {
-    /// The nearest to `x`.
+    /// The nearest value to `x`.
     fn of(x: f64) -> Self;
-    /// e^self.
+    /// The exponential function.
     fn exp(self) -> Self;
     /// Square root.
     fn sqrt(self) -> Self;
@@ -71,12 +71,12 @@ pub(super) struct Image<R> {
 }
 
 impl<R: Real> Image<R> {
-    /// All 0.
+    /// An image of zeros.
     pub fn zeros(channels: usize, height: usize, width: usize) -> Self {
         Self { channels, height, width, values: vec![R::default(); channels * height * width] }
     }
 
-    /// Of a channel.
+    /// Number of pixels per channel.
     pub fn pixels(&self) -> usize {
         self.height * self.width
     }
@@ -86,23 +86,23 @@ impl<R: Real> Image<R> {
         self.values.chunks_exact(self.pixels())
     }
 
-    /// As [`Image::planes`].
+    /// Mutable access to the channels.
     pub fn planes_mut(&mut self) -> std::slice::ChunksExactMut<'_, R> {
         let pixels = self.pixels();
         self.values.chunks_exact_mut(pixels)
     }
 }
 
-/// Parts of a sum over pixels.
+/// Number of partial sums of a sum over pixels.
 const LANES: usize = 16;
-/// Terms that are added at a time, so that a sum is not loaded and stored for each.
+/// Number of terms added at once, so that a sum is not loaded and stored for each term.
 const TERMS: usize = 8;
-/// Channels for one task of a thread.
+/// Number of channels per task.
 const CHANNELS: usize = 4;
-/// Outputs that are made at a time: what a narrow network reads for them fits into the nearest cache.
+/// Number of outputs computed at once: the input of a narrow network for them fits into the L1 cache.
 const OUTPUTS: usize = 256;
 
-/// The sum of `values`, in [`LANES`] parts.
+/// The sum of `values`, in [`LANES`] partial sums.
 pub(super) fn sum<R: Real>(values: &[R]) -> R {
     let mut lanes = [R::default(); LANES];
     for chunk in values.chunks(LANES) {
@@ -113,7 +113,7 @@ pub(super) fn sum<R: Real>(values: &[R]) -> R {
     total(lanes)
 }
 
-/// The sum of the products of `a` and `b`, in [`LANES`] parts.
+/// The dot product of `a` and `b`, in [`LANES`] partial sums.
 pub(super) fn dot<R: Real>(a: &[R], b: &[R]) -> R {
     let mut lanes = [R::default(); LANES];
     for (a, b) in a.chunks(LANES).zip(b.chunks(LANES)) {
@@ -128,27 +128,27 @@ fn total<R: Real>(lanes: [R; LANES]) -> R {
     lanes.into_iter().fold(R::default(), |sum, lane| sum + lane)
 }
 
-/// An image for kernels of `kernel` x `kernel`, odd, with zeros around it.
+/// An image with a zero border for kernels of `kernel` x `kernel`, odd.
 ///
-/// Each row has kernel / 2 zeros before it, and the next row's zeros serve as those behind it. Where an
-/// output lies, in a line of `outputs` of them, the tap at row `ky` and column `kx` reads `ky * stride + kx`
-/// further on. Outputs beyond the right edge are made too, and thrown away.
+/// Each row is preceded by kernel / 2 zeros; the zeros of the next row serve as the border behind it. A line
+/// has `outputs` outputs. For an output at some position, the tap at row `ky` and column `kx` reads
+/// `ky * stride + kx` further on. Outputs beyond the right edge are computed too, and discarded.
 pub(super) struct Lines<R> {
     channels: usize,
     height: usize,
     width: usize,
     kernel: usize,
-    /// From a row to the next.
+    /// Distance from a row to the next.
     stride: usize,
-    /// Outputs of a line: those of all rows, and up to a multiple of [`TERMS`].
+    /// Outputs per line: those of all rows, rounded up to a multiple of [`TERMS`].
     outputs: usize,
-    /// From a channel to the next.
+    /// Distance from a channel to the next.
     length: usize,
     values: Vec<R>,
 }
 
 impl<R: Real> Lines<R> {
-    /// `image` with the zeros that `kernel` needs.
+    /// `image` with the zero border for `kernel`.
     pub fn new(image: &Image<R>, kernel: usize) -> Self {
         let &Image { channels, height, width, .. } = image;
         let border = kernel / 2;
@@ -165,19 +165,19 @@ impl<R: Real> Lines<R> {
         Self { channels, height, width, kernel, stride, outputs, length, values }
     }
 
-    /// Where what the first output reads lies, for each weight of an output, [kernel, kernel, channels].
+    /// Start of the input of the first output, for each weight of an output, [kernel, kernel, channels].
     fn starts(&self) -> Vec<usize> {
         let taps = (0..self.kernel).flat_map(|ky| (0..self.kernel).map(move |kx| ky * self.stride + kx));
         taps.flat_map(|tap| (0..self.channels).map(move |channel| channel * self.length + tap)).collect()
     }
 
-    /// The outputs' own places in the line of a channel; 0 where an output is thrown away.
+    /// The values at the positions of the outputs in the line of a channel; 0 for discarded outputs.
     fn centre(&self, channel: usize) -> &[R] {
         let start = channel * self.length + self.kernel / 2 * (self.stride + 1);
         &self.values[start..start + self.outputs]
     }
 
-    /// The numbers of all channels of a place beside each other, in the order of places.
+    /// The values with all channels of a position adjacent, in order of position.
     fn by_place(&self) -> Vec<R> {
         let mut values = vec![R::default(); self.values.len()];
         for (channel, line) in self.values.chunks_exact(self.length).enumerate() {
@@ -189,8 +189,8 @@ impl<R: Real> Lines<R> {
     }
 }
 
-/// The image whose channel o is the sum of what the taps of `x` read times `weight` [out, kernel, kernel,
-/// channels], plus `bias` [out].
+/// The image whose channel o sums what the taps of `x` read times `weight` [out, kernel, kernel, channels],
+/// plus `bias` [out].
 pub(super) fn correlate<R: Real>(x: &Lines<R>, weight: &[R], bias: &[R]) -> Image<R> {
     let starts = x.starts();
     let mut image = Image::zeros(bias.len(), x.height, x.width);
@@ -212,7 +212,8 @@ pub(super) fn correlate<R: Real>(x: &Lines<R>, weight: &[R], bias: &[R]) -> Imag
     image
 }
 
-/// Adds to `v_weight`, as [`correlate`] has it, the gradient by `weight` from `v_y`, that by its image.
+/// Adds the gradient of `weight`, as in [`correlate`], to `v_weight`; `v_y` is the gradient of the output
+/// image.
 pub(super) fn weight_gradient<R: Real>(x: &Lines<R>, v_y: &Lines<R>, v_weight: &mut [R]) {
     let by_place = x.by_place();
     let length = x.kernel * x.kernel * x.channels;
@@ -232,14 +233,14 @@ pub(super) fn weight_gradient<R: Real>(x: &Lines<R>, v_y: &Lines<R>, v_weight: &
     });
 }
 
-/// A sum that one thread makes.
+/// A sum computed by one thread.
 trait Work<R> {
-    /// Adds to `sums`. Has to be inlined, so that it is compiled for the vectors of its caller.
+    /// Adds to `sums`. Must be inlined, so that it is compiled for the vectors of its caller.
     fn add_to(self, sums: &mut [R]);
 }
 
-/// Calls `work.add_to(sums)`, compiled for AVX2 where the CPU has it. Without FMA, which would round once
-/// less: so the bytes are the same.
+/// Calls `work.add_to(sums)`, compiled for AVX2 if the CPU has it. FMA is not used, because it rounds once
+/// less and would change the bytes.
 fn with_widest_vectors<R: Real>(work: impl Work<R>, sums: &mut [R]) {
     #[cfg(target_arch = "x86_64")]
     {
@@ -255,7 +256,7 @@ fn with_widest_vectors<R: Real>(work: impl Work<R>, sums: &mut [R]) {
     work.add_to(sums);
 }
 
-/// The lines of some channels of [`correlate`], one after the other.
+/// The lines of some channels of [`correlate`], in sequence.
 struct CorrelateBlock<'a, R> {
     x: &'a [R],
     starts: &'a [usize],
@@ -286,15 +287,15 @@ impl<R: Real> Work<R> for CorrelateBlock<'_, R> {
 
 /// [`weight_gradient`] of some channels with the lines `v_y`.
 struct WeightGradientBlock<'a, R> {
-    /// [`Lines::by_place`]: what the taps of one row read for an output lies together.
+    /// [`Lines::by_place`]: the values that the taps of one row read for an output are contiguous.
     x: &'a [R],
-    /// By channel, for [`TERMS`] outputs each.
+    /// By channel, in groups of [`TERMS`] outputs.
     v_y: Vec<&'a [[R; TERMS]]>,
-    /// Weights of a row of a kernel.
+    /// Number of weights in a row of a kernel.
     row: usize,
-    /// From what one row of a kernel reads to what the next one does.
+    /// Distance between the inputs of consecutive kernel rows.
     from_row: usize,
-    /// From what is read for an output to what is read for the next one.
+    /// Distance between the inputs of consecutive outputs.
     from_pixel: usize,
 }
 
@@ -315,10 +316,10 @@ impl<R: Real> Work<R> for WeightGradientBlock<'_, R> {
     }
 }
 
-/// Adds to `to` the numbers of `x` from each of `starts` on, times its factor, in their order.
-// Inlined, so that it is compiled for the vectors of its caller. The terms have names since the compiler
-// makes vectors of the loop over `to`, but at opt-level 2 none of arrays inside it: a step took up to ten
-// times as long.
+/// Adds to `to` the slices of `x` that begin at `starts`, each times its factor, in order.
+// Inlined, so that it is compiled for the vectors of its caller. The terms have names, because the compiler
+// vectorises the loop over `to`, but at opt-level 2 not arrays inside it: a step took up to ten times as
+// long.
 #[inline(always)]
 fn add_terms<R: Real>(to: &mut [R], x: &[R], starts: &[usize; TERMS], factors: &[R; TERMS]) {
     let term = |term: usize| &x[starts[term]..starts[term] + to.len()];
@@ -349,7 +350,7 @@ mod tests {
     }
 
     #[test]
-    fn sums_have_the_same_bytes_with_any_vectors() {
+    fn sums_have_the_same_bytes_with_any_vector_width() {
         let (channels, height, width, to) = (7, 23, 29, 3);
         let image = Image { channels, height, width, values: random(1, channels * height * width) };
         let lines = Lines::new(&image, 3);

@@ -1,5 +1,5 @@
-//! The network against central differences, known answers, and itself resumed; its layers against plain
-//! loops.
+//! Tests of the network against central differences, known answers and a resumed run, and of its layers
+//! against plain loops.
 
 mod layers;
 
@@ -9,12 +9,12 @@ use super::{DepthMap, Learned, MAX_RANGE, RELEASE_PRIOR, WaterParamNet, WaterPar
 use crate::rng::{Stream, uniform_at};
 use crate::water::Water;
 
-/// Numbers in -1..1 from a seed.
+/// Random numbers in -1..1 from a seed.
 fn random(seed: u32, n: usize) -> Vec<f64> {
     (0..n as u32).map(|i| 2.0 * f64::from(uniform_at(seed, Stream::Test, 3, i)) - 1.0).collect()
 }
 
-/// A slope from `near` to `far` over the rows, with a bump whose place depends on `seed`.
+/// A slope from `near` to `far` over the rows, with a bump whose position depends on `seed`.
 fn slope(width: u32, height: u32, near: f32, far: f32, seed: u32) -> DepthMap {
     let at = uniform_at(seed, Stream::Test, 4, 0) * width as f32;
     let values = (0..width * height).map(|i| {
@@ -29,13 +29,13 @@ fn network(channels: u32, seed: u32) -> WaterParamNet {
 }
 
 #[test]
-fn a_new_network_starts_near_its_prior() {
+fn new_network_starts_near_its_prior() {
     for channels in [8, 32] {
         let prior = Water::COASTAL.to_raw(5.0);
         let net = WaterParamNet::new(channels, prior, 3).unwrap();
         let raw = net.predict(&slope(24, 16, 0.5, 2.0, 0)).unwrap();
         for (found, expected) in raw.iter().zip(prior) {
-            // The last layer adds numbers of deviation 0.05 times features of size 0.1 to 1.
+            // The last layer adds values with a deviation of 0.05 times features of size 0.1 to 1.
             assert!((f64::from(*found) - expected).abs() < 0.5, "{raw:?} {prior:?}");
         }
     }
@@ -47,13 +47,13 @@ fn gradients_match_central_differences() {
     let mut layout = Layout::default();
     let unet = UNet::new(&mut layout, channels, RELEASE_PRIOR.to_raw(1.0));
     let lengths: Vec<usize> = layout.places().iter().map(|place| place.length()).collect();
-    // The initial last layer lets little through; a larger one makes every gradient count.
+    // The initial last layer passes little gradient; a larger one makes every gradient count.
     let parameters = Parameters::new(layout, 5);
     let mut weights: Vec<f64> = parameters.values().iter().map(|v| f64::from(*v)).collect();
     let last = weights.len() - 9 - 2 * channels * 9;
     weights[last..].iter_mut().for_each(|w| *w *= 10.0);
 
-    // Noise, so that no two pixels of a window are equal: where they are, the maximum has no derivative.
+    // Noise makes all pixels of a window different: at equal ones, the maximum has no derivative.
     let mut values = slope(width, height, 0.4, 3.0, 1).values().to_vec();
     values.iter_mut().zip(random(28, 384)).for_each(|(value, noise)| *value += 0.1 * noise as f32);
     let depth = DepthMap::new(width, height, values).unwrap();
@@ -66,15 +66,15 @@ fn gradients_match_central_differences() {
     let pass = unet.pass(&weights, &depth, &values, v_raw, true);
     let v_depth = pass.v_depth.unwrap();
 
-    // Three weights of every array, so that none can be without a gradient unseen.
+    // Three weights of every array, so that no array without a gradient goes unnoticed.
     let mut samples = Vec::new();
     let mut start = 0;
     for (array, length) in lengths.iter().enumerate() {
         samples.extend((0..3).map(|k| (array, start + (k * 7919 + array) % length)));
         start += length;
     }
-    // Rounding of the loss over the step is 1e-16 / 1e-6 = 1e-10; a step this small seldom crosses the edge
-    // of a ReLU or of a maximum, of which there are some ten thousand.
+    // Rounding of the loss over the step is 1e-16 / 1e-6 = 1e-10. A step this small seldom crosses the kink
+    // of one of the ten thousand ReLUs and maxima.
     let h = 1e-6;
     let check = |what: String, analytic: f64, numeric: f64, scale: f64| {
         let tolerance = 1e-5 * analytic.abs().max(scale);
@@ -93,8 +93,8 @@ fn gradients_match_central_differences() {
         check(format!("weight {at} of array {array}"), pass.v_weights[at], numeric, 1e-3);
         arrays_with_gradient[array] |= pass.v_weights[at].abs() > 1e-6;
     }
-    // A bias before a normalisation moves its group only a little, but one array in ten without any is a
-    // broken graph.
+    // A bias before a normalisation has little effect on its group. But more than one array in ten without a
+    // gradient means a broken graph.
     let without = arrays_with_gradient.iter().filter(|with| !**with).count();
     assert!(without <= lengths.len() / 10, "{without} of {} arrays", lengths.len());
     for at in (0..values.len()).step_by(13) {
@@ -106,7 +106,7 @@ fn gradients_match_central_differences() {
         assert!(v_depth[at] != 0.0, "depth {at} counts");
     }
 
-    // What is trained with, in f32, is the same within its rounding through a dozen layers.
+    // Training in f32 gives the same up to its rounding through a dozen layers.
     let narrow: Vec<f32> = weights.iter().map(|w| *w as f32).collect();
     let f32s = unet.pass(&narrow, &depth, depth.values(), v_raw.map(|v| v as f32), true);
     let largest = |v: &[f64]| v.iter().fold(0.0_f64, |a, b| a.max(b.abs()));
@@ -120,21 +120,17 @@ fn gradients_match_central_differences() {
     }
 }
 
-/// Trains on (map, target) pairs in turn with half the squared distance of the nine numbers; largest miss at
-/// the end.
+/// Trains on (map, target) pairs in turn, with half the squared distance of the outputs as loss. Returns the
+/// largest error at the end.
 fn overfit(net: &mut WaterParamNet, pairs: &[(DepthMap, [f64; 9])], steps: usize) -> f64 {
     for step in 0..steps {
         let (depth, target) = &pairs[step % pairs.len()];
         let raw = net.predict(depth).unwrap();
         let v_raw = std::array::from_fn(|i| raw[i] - target[i] as f32);
-        // Down to a hundredth over the run, so that Adam settles.
+        // The learning rate decays to a hundredth, so that Adam settles.
         let learning_rate = 0.01 * 0.01_f32.powf(step as f32 / steps as f32);
         let learned = net.learn(depth, v_raw, learning_rate, false).unwrap();
-        assert_eq!(
-            learned,
-            Learned { raw, v_depth: None, stepped: true },
-            "learning makes the same pass again"
-        );
+        assert_eq!(learned, Learned { raw, v_depth: None, stepped: true }, "learning repeats the same pass");
     }
     let miss = |(depth, target): &(DepthMap, [f64; 9])| {
         let raw = net.predict(depth).unwrap();
@@ -151,20 +147,21 @@ fn many_views_agree_on_one_water() {
         (0..6).map(|i| (slope(24, 16, 0.3 + 0.1 * i as f32, 1.0 + 0.4 * i as f32, i), raw)).collect();
     let mut net = network(8, 1);
     let miss = overfit(&mut net, &pairs, 240);
-    assert!(miss < 0.03, "largest miss of the unconstrained numbers {miss}");
+    assert!(miss < 0.03, "largest error of the unconstrained parameters {miss}");
     let found = net.predict(&pairs[0].0).unwrap().map(f64::from);
     let found = Water::from_raw(found, 4.0);
     for (found, expected) in found.to_array().iter().zip(target.to_array()) {
         assert!((found / expected - 1.0).abs() < 0.03, "{found} {expected}");
     }
-    // A view that it never saw gives the same water too.
+    // An unseen view gives the same water.
     let unseen = net.predict(&slope(24, 16, 0.55, 1.9, 77)).unwrap();
     assert!(unseen.iter().zip(raw).all(|(a, b)| (f64::from(*a) - b).abs() < 0.15), "{unseen:?} {raw:?}");
 }
 
 #[test]
-fn the_numbers_depend_on_the_depth() {
-    // The second map is the first one three times as far away: what no normalisation may wipe out.
+fn predictions_depend_on_the_depth() {
+    // The second map is the first one at three times the distance: no normalisation may remove this
+    // difference.
     let (near, far) = (slope(24, 16, 0.4, 1.2, 5), slope(24, 16, 1.2, 3.6, 5));
     let targets = [Water::COASTAL.to_raw(2.0), RELEASE_PRIOR.to_raw(1.0)];
     let mut net = network(8, 2);
@@ -173,7 +170,7 @@ fn the_numbers_depend_on_the_depth() {
     assert!(miss < 0.05 && apart > 0.5, "miss {miss}, targets {apart} apart");
 }
 
-/// Trains a little at a size where threads share the work; the state and what every step gave.
+/// Trains briefly at a size where threads share the work; returns the state and the result of every step.
 fn short_run(seed: u32) -> (Vec<u8>, Vec<Learned>) {
     let mut net = network(16, seed);
     let learned = (0..3)
@@ -186,7 +183,7 @@ fn short_run(seed: u32) -> (Vec<u8>, Vec<Learned>) {
 }
 
 #[test]
-fn the_same_seed_gives_the_same_bytes_whatever_the_number_of_threads() {
+fn same_seed_gives_the_same_bytes_on_any_number_of_threads() {
     let with = |threads: usize, seed: u32| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
         pool.install(|| short_run(seed))
@@ -199,7 +196,7 @@ fn the_same_seed_gives_the_same_bytes_whatever_the_number_of_threads() {
 }
 
 #[test]
-fn a_resumed_run_gives_the_bytes_of_an_uninterrupted_one() {
+fn resumed_run_gives_the_bytes_of_an_uninterrupted_one() {
     let train = |net: &mut WaterParamNet, steps: std::ops::Range<u32>| {
         for i in steps {
             net.learn(&slope(24, 16, 0.5, 2.0, i), [0.1; 9], 1e-2, false).unwrap();
@@ -209,7 +206,7 @@ fn a_resumed_run_gives_the_bytes_of_an_uninterrupted_one() {
     train(&mut whole, 0..6);
     let mut first = network(8, 4);
     train(&mut first, 0..3);
-    // Another seed: everything that counts comes from the bytes.
+    // With another seed, everything that counts must come from the bytes.
     let mut second = network(8, 99);
     second.restore(&first.to_bytes()).unwrap();
     train(&mut second, 3..6);
@@ -217,7 +214,7 @@ fn a_resumed_run_gives_the_bytes_of_an_uninterrupted_one() {
 }
 
 #[test]
-fn foreign_torn_and_damaged_states_are_refused_and_change_nothing() {
+fn foreign_or_damaged_states_are_refused_and_change_nothing() {
     let mut net = network(8, 4);
     let sound = net.to_bytes();
     let other = network(16, 4).to_bytes();
@@ -244,7 +241,7 @@ fn foreign_torn_and_damaged_states_are_refused_and_change_nothing() {
 }
 
 #[test]
-fn bad_maps_and_gradients_stay_finite_and_are_told() {
+fn bad_maps_and_gradients_are_reported_and_stay_finite() {
     let mut net = network(8, 6);
     let bad = |value: f32| DepthMap::new(24, 16, vec![value; 24 * 16]).unwrap();
     for (value, unusable, coverage) in
@@ -273,7 +270,7 @@ fn bad_maps_and_gradients_stay_finite_and_are_told() {
 }
 
 #[test]
-fn a_network_that_has_diverged_says_so() {
+fn diverged_network_is_reported() {
     let mut net = network(8, 6);
     let depth = slope(24, 16, 0.5, 2.0, 0);
     net.learn(&depth, [1.0; 9], f32::MAX, false).unwrap();
@@ -283,7 +280,7 @@ fn a_network_that_has_diverged_says_so() {
 }
 
 #[test]
-fn networks_that_cannot_be_made_are_refused() {
+fn invalid_networks_are_refused() {
     let prior = RELEASE_PRIOR.to_raw(1.0);
     for channels in [0, 4, 12, 264] {
         let error = WaterParamNet::new(channels, prior, 0).err().unwrap().to_string();

@@ -1,5 +1,5 @@
-//! WaterParamPredict: the U-Net of SMP-UWGS section 3.2 that maps the ranges of a view to nine numbers (eq.
-//! 8).
+//! WaterParamPredict: the U-Net of SMP-UWGS section 3.2, which maps the ranges of a view to the water
+//! parameters (eq. 8).
 //!
 //! ```text
 //! depth [1,H,W] ->  conv 1->C, norm, relu, SE-residual, halve            = e1 [C, H/2, W/2]
@@ -10,17 +10,17 @@
 //!                 -> conv C->4C, mean over pixels -> FC 4C->2C, relu -> FC 2C->9
 //! ```
 //!
-//! C is 64 in the release (`dpr_net/water_param_predictor.py`); a narrower one has the same shape and costs
-//! less. Initial values as there: Kaiming by fan-out for convolutions, Xavier with gain 0.35 for the first
-//! FC, N(0, 0.05^2) for the last, whose bias is the prior. Departures:
+//! C is 64 in the release (`dpr_net/water_param_predictor.py`); a narrower network has the same structure and
+//! costs less. Initial values are those of the release: Kaiming by fan-out for convolutions, Xavier with gain
+//! 0.35 for the first FC. The last FC has N(0, 0.05^2), and the prior as bias. Differences:
 //!
-//! - Group normalisation in place of batch normalisation, which a batch of one breaks (`GroupNorm`).
-//! - No dropout (0.3 between the FCs there): with a batch of one it would be noise on the one water that all
-//!   views share, and the pass that `learn` makes again would not be the pass that `predict` made.
-//! - The mean over pixels of the last convolution is taken from means of its input, which is the same number
-//!   (`MeanConv`) without the most expensive layer of the network.
-//! - The depth map keeps one unit for the whole scene and has 0 where there is nothing; the release stretches
-//!   every view to 1200 x 800.
+//! - Group normalisation in place of batch normalisation, which fails with a batch of one (`GroupNorm`).
+//! - No dropout (0.3 between the FCs in the release). With a batch of one it would add noise to the single
+//!   water of all views. The pass repeated in `learn` would also differ from that of `predict`.
+//! - The mean over pixels of the last convolution is computed from means of its input. This gives the same
+//!   value (`MeanConv`) without the most expensive layer of the network.
+//! - The depth map has one unit for the whole scene, and 0 where nothing is seen; the release stretches every
+//!   view to 1200 x 800.
 
 use super::attention::{AttentionGate, Gated, Residual, SeResidual};
 use super::layers::{
@@ -32,11 +32,11 @@ use super::{DepthMap, Learned, WaterParamPredictor};
 use crate::water::Water;
 use crate::{CoreError, Result};
 
-/// Prior of the release, for a scene whose unit is the usual viewing distance: `RELEASE_PRIOR.to_raw(1.0)`.
+/// Prior of the release, with the scene scale as unit: `RELEASE_PRIOR.to_raw(1.0)`.
 pub const RELEASE_PRIOR: Water =
     Water { beta_d: [0.75, 0.30, 0.50], beta_b: [0.75, 0.40, 0.40], b_inf: [0.10, 0.25, 0.45] };
 
-/// The network with its weights and the state of its Adam.
+/// The network with its weights and its Adam state.
 pub struct WaterParamNet {
     unet: UNet,
     parameters: Parameters,
@@ -44,15 +44,14 @@ pub struct WaterParamNet {
 
 impl WaterParamNet {
     /// A network of `channels` (C above; 64 in the release, a multiple of 8 here) that starts near `prior`:
-    /// the nine unconstrained numbers of `Water::to_raw`. The same seed gives the same weights.
+    /// the unconstrained water parameters of `Water::to_raw`. The same seed gives the same weights.
     ///
     /// # Errors
-    /// [`CoreError::Network`] when `channels` is no multiple of 8 or not from 8 to 256, or `prior` is not
-    /// finite.
+    /// [`CoreError::Network`] when `channels` is not a multiple of 8 from 8 to 256, or `prior` is not finite.
     pub fn new(channels: u32, prior: [f64; 9], seed: u32) -> Result<Self> {
         if !channels.is_multiple_of(8) || !(8..=256).contains(&channels) {
             return Err(CoreError::Network(format!(
-                "{channels} channels do not fit: they have to be a multiple of 8, from 8 to 256"
+                "{channels} channels are not possible: their number must be a multiple of 8, from 8 to 256"
             )));
         }
         if !prior.iter().all(|number| number.is_finite()) {
@@ -63,7 +62,7 @@ impl WaterParamNet {
         Ok(Self { unet, parameters: Parameters::new(layout, seed) })
     }
 
-    /// How many weights it has.
+    /// Number of weights.
     pub fn weights(&self) -> usize {
         self.parameters.values().len()
     }
@@ -88,7 +87,7 @@ impl WaterParamPredictor for WaterParamNet {
     ) -> Result<Learned> {
         if !(learning_rate >= 0.0 && learning_rate.is_finite()) {
             return Err(CoreError::Network(format!(
-                "its learning rate is {learning_rate}, which is no length of a step"
+                "its learning rate is {learning_rate}; it must be a finite number, 0 or more"
             )));
         }
         let pass = self.unet.pass(self.parameters.values(), depth, depth.values(), v_raw, wants_depth);
@@ -108,7 +107,7 @@ impl WaterParamPredictor for WaterParamNet {
     }
 }
 
-/// Layers of the network; the weights are elsewhere.
+/// Layers of the network; the weights are stored separately.
 pub(super) struct UNet {
     channels: usize,
     encoder_1: Encoder,
@@ -123,7 +122,7 @@ pub(super) struct UNet {
     last: Linear,
 }
 
-/// Convolution, norm, ReLU and SE-residual, then half the size.
+/// Convolution, norm, ReLU and SE-residual, then halving.
 struct Encoder {
     conv: Conv,
     norm: GroupNorm,
@@ -163,7 +162,7 @@ impl Encoder {
     }
 }
 
-/// What the layers of an [`Encoder`] keep; `full` is what was halved.
+/// State that the layers of an [`Encoder`] keep; `full` is the image before halving.
 struct Encoded<R> {
     normal: Normal<R>,
     residual: Residual<R>,
@@ -171,7 +170,7 @@ struct Encoded<R> {
     places: Vec<usize>,
 }
 
-/// What the layers of a [`UNet`] keep, and what was between them, with the names of the drawing above.
+/// State that the layers of a [`UNet`] keep, and their intermediate images, named as in the diagram above.
 pub(super) struct Trace<R> {
     depth: Image<R>,
     encoded_1: Encoded<R>,
@@ -189,12 +188,12 @@ pub(super) struct Trace<R> {
     hidden: Vec<R>,
 }
 
-/// Numbers and gradients of one pass forward and backward.
+/// Outputs and gradients of a forward and a backward pass.
 pub(super) struct Pass<R> {
     pub raw: [R; 9],
-    /// By weights, in their order.
+    /// Gradient of the weights, in their order.
     pub v_weights: Vec<R>,
-    /// By the values of the depth map.
+    /// Gradient of the values of the depth map.
     pub v_depth: Option<Vec<R>>,
 }
 
@@ -222,7 +221,7 @@ impl UNet {
         }
     }
 
-    /// The nine numbers of a depth image [1,H,W].
+    /// The unconstrained water parameters of a depth image [1,H,W].
     pub fn forward<R: Real>(&self, weights: &[R], depth: Image<R>) -> ([R; 9], Trace<R>) {
         let (e1, encoded_1) = self.encoder_1.forward(weights, &depth);
         let (e2, encoded_2) = self.encoder_2.forward(weights, &e1);
@@ -254,7 +253,7 @@ impl UNet {
         (raw, trace)
     }
 
-    /// From the gradient by the nine to that by the depth image, and by the weights, which is added to
+    /// Returns the gradient of the depth image from that of the outputs; adds the gradient of the weights to
     /// `v_weights`.
     pub fn backward<R: Real>(
         &self,
@@ -279,7 +278,8 @@ impl UNet {
         self.encoder_1.backward(weights, &t.depth, &t.encoded_1, &v_e1, v_weights)
     }
 
-    /// Forward and backward, with `v_raw` the gradient by the nine; `values` has the values of `depth`.
+    /// Forward and backward pass, with `v_raw` the gradient of the outputs; `values` are the values of
+    /// `depth`.
     pub fn pass<R: Real>(
         &self,
         weights: &[R],
@@ -291,7 +291,7 @@ impl UNet {
         let (raw, trace) = self.forward(weights, image(depth, values));
         let mut v_weights = vec![R::default(); weights.len()];
         let mut v_depth = self.backward(weights, &trace, v_raw, &mut v_weights).values;
-        // What is nothing, or was cut off, does not move.
+        // Empty or clipped values have no gradient.
         for (v, value) in v_depth.iter_mut().zip(depth.values()) {
             if !DepthMap::is_live(*value) {
                 *v = R::default();
@@ -301,7 +301,7 @@ impl UNet {
     }
 }
 
-/// [1,H,W] of `values`, which lie as those of `depth`.
+/// `values` as an image [1,H,W], in the layout of `depth`.
 pub(super) fn image<R: Real>(depth: &DepthMap, values: &[R]) -> Image<R> {
     let (height, width) = (depth.height() as usize, depth.width() as usize);
     Image { channels: 1, height, width, values: values.to_vec() }

@@ -106,7 +106,7 @@ impl Schedule {
 
     /// Degree of the spherical harmonics in use.
     pub(super) fn sh_degree(&self, progress: f32) -> u32 {
-        if self.water.as_ref().is_some_and(|water| water.has_plain_colours(progress)) {
+        if self.water.as_ref().is_some_and(|water| water.has_sh0_only(progress)) {
             return 0;
         }
         let reached = self.config.sh_degree_at.iter().filter(|&&at| progress >= at).count() as u32;

@@ -1,9 +1,9 @@
-//! Small dense systems and least squares, for fits of a few unknowns.
+//! Small dense linear systems and least squares for fits with a few unknowns.
 
-/// Steps of [`least_squares`].
+/// Maximum number of steps of [`least_squares`].
 const STEPS: usize = 80;
 
-/// x of `matrix x = right` by Gaussian elimination with pivots; `None` where the matrix is singular.
+/// Solves `matrix x = right` by Gaussian elimination with pivoting; `None` if the matrix is singular.
 pub(super) fn solve<const N: usize>(mut matrix: [[f64; N]; N], mut right: [f64; N]) -> Option<[f64; N]> {
     for column in 0..N {
         let pivot =
@@ -23,7 +23,7 @@ pub(super) fn solve<const N: usize>(mut matrix: [[f64; N]; N], mut right: [f64; 
     Some(std::array::from_fn(|k| right[k] / matrix[k][k]))
 }
 
-/// Where a sum of squares is least, within bounds, and the inverse of its curvature there (`None` where that
+/// The minimum of a sum of squares within bounds, and the diagonal of the inverse Hessian there (`None` if it
 /// is singular).
 pub(super) struct Least<const N: usize> {
     pub(super) at: [f64; N],
@@ -34,7 +34,7 @@ pub(super) struct Least<const N: usize> {
 /// Levenberg-Marquardt from `start`, with derivatives by central differences; each unknown stays within its
 /// `bounds`.
 ///
-/// `residuals` appends to an empty vector, as many for any unknowns. Unknowns are of order 1.
+/// `residuals` appends to an empty vector, always the same number. Unknowns are of order 1.
 pub(super) fn least_squares<const N: usize>(
     start: [f64; N],
     bounds: [[f64; 2]; N],
@@ -98,7 +98,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_system_is_solved_and_a_singular_one_refused() {
+    fn regular_system_is_solved_and_singular_one_refused() {
         let found = solve([[0.0, 2.0, 1.0], [1.0, -1.0, 0.0], [3.0, 0.0, -2.0]], [5.0, -1.0, -3.0]);
         let x = found.expect("regular");
         let expected = [3.0 / 7.0, 10.0 / 7.0, 15.0 / 7.0];
@@ -107,7 +107,7 @@ mod tests {
     }
 
     #[test]
-    fn an_exponential_is_found_within_bounds_with_its_variances() {
+    fn exponential_is_fitted_within_bounds_with_variances() {
         let seen: Vec<(f64, f64)> =
             (0..40).map(|k| f64::from(k) * 0.1).map(|t| (t, 3.0 * (-0.7 * t).exp())).collect();
         let fit = |bounds| {
@@ -118,7 +118,7 @@ mod tests {
         let free = fit([[-5.0, 5.0]; 2]);
         assert!((free.at[0] - 3.0_f64.ln()).abs() < 1e-6 && (free.at[1] - 0.7).abs() < 1e-6, "{:?}", free.at);
         assert!(free.cost < 1e-8);
-        let variances = free.covariance.expect("both are seen");
+        let variances = free.covariance.expect("both are determined");
         assert!(variances.iter().all(|v| (1e-6..0.1).contains(v)), "{variances:?}");
         assert!((fit([[-5.0, 5.0], [0.0, 0.5]]).at[1] - 0.5).abs() < 1e-9, "a bound holds");
     }

@@ -5,11 +5,11 @@ use serde::{Deserialize, Serialize};
 
 use super::Water;
 
-/// How the colour of open water changes with direction (SMP-UWGS eq. 7 has `B_inf(x, y)`).
+/// Change of the open-water colour with direction (SMP-UWGS eq. 7 has `B_inf(x, y)`).
 ///
 /// Along the unit direction `d`, from the camera into the scene, channel c is `b_inf[c] * exp(clamp(slopes[c]
-/// . (d - middle), -most, most))`. Axes are those of the scene. The clamp keeps the colour within what was
-/// seen: nothing is known of directions that no photograph looks into.
+/// . (d - middle), -most, most))`. Axes are those of the scene. The clamp keeps the colour in the observed
+/// range, since no photograph shows the other directions.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ByDirection {
@@ -31,20 +31,20 @@ impl ByDirection {
         self.slopes.map(|slope| DVec3::from(slope).dot(offset).clamp(-self.most, self.most).exp())
     }
 
-    /// `water` as it is along `direction`, unit length, scene axes.
+    /// The water along `direction`, unit length, scene axes.
     pub fn along(&self, water: &Water, direction: DVec3) -> Water {
         let factors = self.factors(direction);
         Water { b_inf: std::array::from_fn(|c| water.b_inf[c] * factors[c]), ..*water }
     }
 
-    /// The same where the scene's axes were turned by `turn`.
+    /// The same after the scene's axes were rotated by `turn`.
     #[must_use]
     pub fn turned(&self, turn: glam::DQuat) -> Self {
         let turned = |v: [f64; 3]| (turn * DVec3::from(v)).to_array();
         Self { middle: turned(self.middle), slopes: self.slopes.map(turned), most: self.most }
     }
 
-    /// Whether all numbers are finite, the middle is a direction and the colour stays within a factor of
+    /// Whether all values are finite, the middle has unit length, and the colour stays within a factor of
     /// eight.
     pub fn is_sound(&self) -> bool {
         let length = DVec3::from(self.middle).length();
@@ -68,7 +68,7 @@ mod tests {
     }
 
     #[test]
-    fn the_colour_is_that_of_the_middle_there_and_grows_upwards_to_a_limit() {
+    fn colour_grows_upwards_from_the_middle_to_a_limit() {
         let by_direction = brighter_upwards();
         assert!(by_direction.is_sound());
         assert_eq!(by_direction.along(&Water::COASTAL, DVec3::Z), Water::COASTAL);
@@ -79,7 +79,7 @@ mod tests {
     }
 
     #[test]
-    fn turning_the_axes_turns_the_colours_with_them() {
+    fn rotating_the_axes_rotates_the_colours() {
         let turn = glam::DQuat::from_rotation_x(0.7) * glam::DQuat::from_rotation_y(-1.1);
         let (before, after) = (brighter_upwards(), brighter_upwards().turned(turn));
         assert!(after.is_sound());
@@ -91,7 +91,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_a_colour_by_direction_is_told_apart() {
+    fn broken_colours_by_direction_are_not_sound() {
         let sound = brighter_upwards();
         for broken in [
             ByDirection { middle: [0.0; 3], ..sound },

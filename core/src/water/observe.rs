@@ -1,14 +1,13 @@
-//! What photographs show of sparse points, for [`sparse_prior`](super::sparse_prior).
+//! Samples the colours of sparse points in photographs, for [`sparse_prior`](super::sparse_prior).
 //!
-//! A colour is the mean of a square window that has the same size on the scene at every range: a far view
-//! blurs what a near one resolves, and points are where texture is strong, so that single pixels of one point
-//! would differ by more than the water does. Which views saw a point is in its track. Without tracks it is
-//! every view that the point projects into, unless a much nearer sparse point lies in the same direction;
-//! what is wrong with that is left to the robust estimate.
+//! A colour is the mean of a square window of the same size in the scene at every range. A distant view blurs
+//! what a near one resolves, and points lie on strong texture. Single pixels of a point would therefore
+//! differ by more than the effect of the water. The track of a point lists the views that saw it. Without
+//! tracks, it is every view that the point projects into, unless a much nearer sparse point lies in the same
+//! direction. The robust estimate handles the errors of this rule.
 //!
-//! Work is bounded by [`MAX_POINTS`], [`MAX_OBSERVATIONS`] and, without tracks, [`MAX_VIEWS`]; points and
-//! views are thinned out evenly. Each photograph is loaded at most once, and no more at a time than there are
-//! threads.
+//! Work is limited by [`MAX_POINTS`], [`MAX_OBSERVATIONS`] and, without tracks, [`MAX_VIEWS`]; points and
+//! views are thinned evenly. Each photograph is loaded at most once, with at most one in memory per thread.
 
 use std::sync::LazyLock;
 
@@ -21,50 +20,50 @@ use crate::scene::{PinholeCamera, Points};
 use crate::views::{PackedImage, TrainView, ViewSource};
 use crate::{CoreError, Result};
 
-/// Points that are looked at.
+/// Maximum number of points sampled.
 pub const MAX_POINTS: usize = 20_000;
-/// Colours that are taken.
+/// Maximum number of colours sampled.
 pub const MAX_OBSERVATIONS: usize = 300_000;
-/// Views that are looked through where there are no tracks.
+/// Maximum number of views sampled without tracks.
 pub const MAX_VIEWS: usize = 512;
 
-/// Half the side of a window at the median range, pixels. What a window shows of a point still follows from
-/// its range a little: a pixel of a far view blurs, and one that looks along the ground covers more of it. On
-/// the wreck in nine waters (240x180) green beta_b came out 5 to 16 % too high with 2, up to 7 % with 3, and
-/// up to 14 % with 9, where windows hold what lies nearer or farther than the point.
+/// Half the side of a window at the median range, pixels. The colour in a window still depends slightly on
+/// range: pixels of a distant view blur, and a view along the ground covers more of it. On the wreck in nine
+/// waters (240x180), this value gave a green beta_b that was up to 7 % too high. With 2, it was 5 to 16 % too
+/// high. With 9, it was up to 14 %, since windows then include surfaces nearer or farther than the point.
 const HALF_WINDOW_PX: f64 = 3.0;
-/// No larger share of the longer side of the picture, as small pictures have more of a scene's edges than of
-/// its detail; but at least [`MIN_HALF_WINDOW_PX`].
+/// Maximum as a share of the longer side of the picture, since small pictures show edges rather than detail;
+/// but at least [`MIN_HALF_WINDOW_PX`].
 const MAX_HALF_WINDOW_SHARE: f64 = 1.0 / 80.0;
 const MIN_HALF_WINDOW_PX: f64 = 1.5;
-/// The smaller window that tells how much follows from the window, as a share of the other.
+/// Size of the smaller window, which shows the effect of window size, as a share of the other.
 const FINER: f64 = 0.5;
-/// No window has a larger half side, pixels.
+/// Maximum half side of any window, pixels.
 const MAX_HALF_WINDOW_PX: f64 = 12.0;
-/// Codes from here on may stand for any brighter light.
+/// Codes from this one on may be saturated.
 const SATURATED: u8 = 254;
-/// Cells along the longer side of a picture in which nearer points hide farther ones.
+/// Number of cells along the longer side of a picture, in which nearer points hide farther ones.
 const CELLS: f64 = 64.0;
-/// How much farther than the nearest point of its cell a point may be and still count as seen.
+/// Maximum range of a visible point relative to the nearest point of its cell.
 const HIDDEN_BEYOND: f64 = 1.1;
-/// Points that may hide others.
+/// Maximum number of points that may hide others.
 const MAX_HIDING: usize = 200_000;
 
-/// Linear light of every 8-bit code.
+/// Linear light of each 8-bit code.
 static LINEAR: LazyLock<[f64; 256]> =
     LazyLock::new(|| std::array::from_fn(|code| srgb_to_linear(code as f64 / 255.0)));
 
-/// What [`observe`] found.
+/// The result of [`observe`].
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Observed {
-    /// For each point that was looked at, its index in the scene; ascending.
+    /// The scene index of each point used; ascending.
     pub points: Vec<u32>,
-    /// Colours, by point and range; their `point` is an index into `points`.
+    /// Colours by point and range; their `point` is an index into `points`.
     pub observations: Vec<Observation>,
 }
 
 impl Observed {
-    /// Has the colour of open water change with direction as `by_direction` says.
+    /// Sets the tints of the observations from `by_direction`.
     pub fn tint(&mut self, by_direction: &ByDirection) {
         for seen in &mut self.observations {
             seen.tint = by_direction.factors(DVec3::from(seen.direction));
@@ -72,7 +71,7 @@ impl Observed {
     }
 }
 
-/// One point to be looked up in one view.
+/// One point to sample in one view.
 #[derive(Clone, Copy)]
 struct Sighting {
     point: u32,
@@ -80,13 +79,13 @@ struct Sighting {
     range: f64,
 }
 
-/// Colours of the sparse points in the photographs of `source`.
+/// Samples the colours of the sparse points in the photographs of `source`.
 ///
-/// `scene_views[i]` is the index of the source's view `i` among the views of the scene by name, which the
-/// tracks of `points` refer to; views that `source` lacks, as held-out ones, are not looked at.
+/// `scene_views[i]` is the index of the source's view `i` among the views of the scene by name. The tracks of
+/// `points` refer to these indices. Views missing from `source`, such as held-out views, are ignored.
 ///
 /// # Errors
-/// When `scene_views` is not one index a view, or a photograph cannot be loaded.
+/// When `scene_views` does not have one index per view, or a photograph cannot be loaded.
 pub fn observe(points: &Points, source: &dyn ViewSource, scene_views: &[u32]) -> Result<Observed> {
     let views = source.views();
     if scene_views.len() != views.len() {
@@ -106,7 +105,7 @@ pub fn observe(points: &Points, source: &dyn ViewSource, scene_views: &[u32]) ->
         return Ok(Observed::default());
     };
 
-    // By view, so that a photograph is loaded once; `order` leads back to points.
+    // Grouped by view, so that each photograph is loaded once; `order` maps back to sightings.
     let mut order: Vec<u32> = (0..sightings.len() as u32).collect();
     order.sort_by_key(|&index| sightings[index as usize].view);
     let by_view: Vec<&[u32]> =
@@ -149,14 +148,13 @@ fn place(points: &Points, points_of_scene: &[u32], sighting: &Sighting) -> DVec3
     position(points, points_of_scene[sighting.point as usize])
 }
 
-/// Evenly spaced `most` of the numbers, all where there are fewer.
+/// At most `most` of the numbers, evenly spaced.
 fn evenly(numbers: &[u32], most: usize) -> Vec<u32> {
     let kept = numbers.len().min(most);
     (0..kept).map(|k| numbers[(k as u64 * numbers.len() as u64 / kept as u64) as usize]).collect()
 }
 
-/// Where the point is in the picture, pixels, and its range; `None` behind the camera and outside the
-/// picture.
+/// The pixel position and the range of a point; `None` behind the camera or outside the picture.
 pub(super) fn project(view: &TrainView, point: DVec3) -> Option<([f64; 2], f64)> {
     let PinholeCamera { width, height, fx, fy, cx, cy } = view.camera;
     let p = view.pose.transform(point);
@@ -165,7 +163,7 @@ pub(super) fn project(view: &TrainView, point: DVec3) -> Option<([f64; 2], f64)>
     inside.then(|| ([x, y], p.length()))
 }
 
-/// Sightings of points with two of them or more, by point and range.
+/// Sightings of points that have at least two, by point and range.
 fn by_tracks(points: &Points, views: &[TrainView], scene_views: &[u32]) -> (Vec<u32>, Vec<Sighting>) {
     let largest = scene_views.iter().max().map_or(0, |view| *view as usize + 1);
     let mut view_of_scene = vec![None; largest];
@@ -197,7 +195,7 @@ fn by_tracks(points: &Points, views: &[TrainView], scene_views: &[u32]) -> (Vec<
     (chosen, sightings)
 }
 
-/// As [`by_tracks`], from geometry alone.
+/// Like [`by_tracks`], from geometry alone.
 fn by_projection(points: &Points, views: &[TrainView]) -> (Vec<u32>, Vec<Sighting>) {
     let all: Vec<u32> = (0..points.len() as u32).collect();
     let chosen = evenly(&all, MAX_POINTS);
@@ -236,7 +234,7 @@ fn by_projection(points: &Points, views: &[TrainView]) -> (Vec<u32>, Vec<Sightin
     (chosen, sightings)
 }
 
-/// At most [`MAX_OBSERVATIONS`]: of the points with the most sightings some are left out, evenly from near to
+/// Reduces sightings to [`MAX_OBSERVATIONS`]: points with the most sightings lose some, evenly from near to
 /// far.
 fn thinned(sightings: Vec<Sighting>) -> Vec<Sighting> {
     let of_point = || sightings.chunk_by(|a, b| a.point == b.point);
@@ -244,7 +242,7 @@ fn thinned(sightings: Vec<Sighting>) -> Vec<Sighting> {
     if sightings.len() <= MAX_OBSERVATIONS {
         return sightings;
     }
-    // The largest number a point may have: 20,000 points have room for 15 at least.
+    // Finds the largest possible number per point: 20,000 points have room for at least 15 each.
     let (mut low, mut high) = (2, sightings.len());
     while low + 1 < high {
         let middle = low.midpoint(high);
@@ -252,7 +250,7 @@ fn thinned(sightings: Vec<Sighting>) -> Vec<Sighting> {
     }
     let thin = |own: &[Sighting]| -> Vec<Sighting> {
         let count = own.len().min(low);
-        // The nearest and the farthest are kept: they tell the most.
+        // The nearest and the farthest are kept, since they carry the most information.
         (0..count).map(|k| own[if count > 1 { k * (own.len() - 1) / (count - 1) } else { 0 }]).collect()
     };
     of_point().flat_map(thin).collect()
@@ -270,8 +268,8 @@ fn window_in_scene(sightings: &[Sighting], views: &[TrainView]) -> Option<f64> {
     (!halves.is_empty()).then(|| *halves.select_nth_unstable_by(middle, f64::total_cmp).1)
 }
 
-/// Mean colour in linear light of the window around a point, NaN in a channel with a saturated pixel; `None`
-/// where the point or a pixel of its window is masked, or the point is not in the picture.
+/// Mean colour in linear light of the window around a point, NaN in a channel with a saturated pixel. `None`
+/// if a pixel of the window is masked, or the point is outside the picture.
 fn look_up(image: &PackedImage, view: &TrainView, point: DVec3, half_window: f64) -> Option<[f64; 3]> {
     let ([x, y], range) = project(view, point)?;
     let sides = |at: f64, focal: f64, size: u32| {

@@ -1,4 +1,4 @@
-//! What is looked up is what the photographs show, and no more of it than is allowed.
+//! Samples match the photographs, and their number is limited.
 
 use std::sync::Arc;
 
@@ -10,7 +10,7 @@ use crate::synth::{SynthOptions, synthesise};
 use crate::views::InMemory;
 use crate::water::{Water, sparse_prior};
 
-/// A camera of 40 x 30 pixels at `distance` before the origin, looking at it.
+/// A camera of 40 x 30 pixels at `distance` in front of the origin, looking at it.
 fn view(name: &str, distance: f64) -> TrainView {
     let camera = PinholeCamera { width: 40, height: 30, fx: 20.0, fy: 20.0, cx: 20.0, cy: 15.0 };
     let pose = Pose::looking_at(DVec3::new(0.0, 0.0, -distance), DVec3::ZERO, DVec3::Y);
@@ -30,7 +30,7 @@ fn points(places: &[[f64; 3]], tracks: &[&[u32]]) -> Points {
 }
 
 #[test]
-fn colours_are_those_at_the_point_in_linear_light_and_ranges_lie_along_the_ray() {
+fn samples_have_linear_colours_and_ranges_along_the_ray() {
     let mut source = InMemory::plain(vec![view("a", 2.0), view("c", 4.0)], grey(10));
     // The point at (0.5, 0, 0) is at x = 25 of the near view and at 22.5 of the far one, y = 15.
     for (image, columns) in source.images.iter_mut().zip([22..28, 21..24]) {
@@ -42,7 +42,7 @@ fn colours_are_those_at_the_point_in_linear_light_and_ranges_lie_along_the_ray()
     // View 1 of the scene is held out.
     let points = points(&[[0.5, 0.0, 0.0], [0.0, 0.0, 0.0]], &[&[0, 1, 2], &[0, 1]]);
     let observed = observe(&points, &source, &[0, 2]).unwrap();
-    assert_eq!(observed.points, [0], "the other point is seen by one view only");
+    assert_eq!(observed.points, [0], "only one view shows the other point");
     assert_eq!(observed.observations.len(), 2);
     for (observation, distance) in observed.observations.iter().zip([2.0_f64, 4.0]) {
         assert!((observation.range - (0.25 + distance * distance).sqrt()).abs() < 1e-9);
@@ -53,7 +53,7 @@ fn colours_are_those_at_the_point_in_linear_light_and_ranges_lie_along_the_ray()
 }
 
 #[test]
-fn the_smaller_window_shows_less_of_what_is_around_the_point() {
+fn smaller_window_covers_less_around_the_point() {
     let mut source = InMemory::plain(vec![view("a", 2.0), view("b", 4.0)], grey(10));
     // A bright stripe of two pixels around the middle of both.
     for image in &mut source.images {
@@ -63,8 +63,8 @@ fn the_smaller_window_shows_less_of_what_is_around_the_point() {
     let points = points(&[[0.0, 0.0, 0.0]], &[&[0, 1]]);
     let observed = observe(&points, &source, &[0, 1]).unwrap();
     let [dark, bright] = [10.0, 200.0].map(|code| srgb_to_linear(code / 255.0));
-    // The windows have 1.5 pixels each way at the median range, which is that of the far view, and half of
-    // that.
+    // The windows have a half side of 1.5 pixels at the median range, which is that of the far view, and half
+    // of that.
     for (observation, half) in observed.observations.iter().zip([3.0, 1.5]) {
         for (found, half) in [(observation.colour, half), (observation.finer, half / 2.0)] {
             let share = 1.0_f64.min(1.0 / half);
@@ -79,7 +79,7 @@ fn a_window_covers_the_same_patch_of_the_scene_at_every_range() {
     let view = view("a", 2.0);
     let camera = view.camera;
     let mut image = PackedImage { width: 40, height: 30, pixels: vec![grey(0); 1200] };
-    // White light of one pixel left of the middle: its share of the window is one by the window's area.
+    // One bright pixel left of the middle: its share of the window is one divided by the window's area.
     image.pixels[14 * 40 + 19] = grey(200);
     let bright = srgb_to_linear(200.0 / 255.0);
     for (half_window, area) in [(0.1, 4.0), (0.2, 16.0), (0.25, 25.0)] {
@@ -94,7 +94,7 @@ fn a_window_covers_the_same_patch_of_the_scene_at_every_range() {
 }
 
 #[test]
-fn masked_and_saturated_pixels_say_nothing() {
+fn masked_and_saturated_pixels_are_ignored() {
     let view = view("a", 2.0);
     let plain = PackedImage { width: 40, height: 30, pixels: vec![grey(99); 1200] };
     let with = |pixel: u32| {
@@ -112,9 +112,9 @@ fn masked_and_saturated_pixels_say_nothing() {
 }
 
 #[test]
-fn without_tracks_every_view_counts_but_those_before_which_something_nearer_lies() {
+fn without_tracks_points_behind_nearer_ones_are_skipped() {
     let source = InMemory::plain(vec![view("a", 2.0), view("b", 4.0)], grey(99));
-    // The second point lies behind the first for both views, the third beside them.
+    // For both views, the second point is behind the first, and the third is beside them.
     let points = points(&[[0.0, 0.0, 0.0], [0.0, 0.0, 3.0], [1.0, 0.5, 0.0]], &[]);
     let observed = observe(&points, &source, &[0, 1]).unwrap();
     let seen: Vec<u32> = observed.observations.iter().map(|o| o.point).collect();
@@ -122,7 +122,7 @@ fn without_tracks_every_view_counts_but_those_before_which_something_nearer_lies
 }
 
 #[test]
-fn the_number_of_observations_is_bounded_and_near_and_far_stay() {
+fn thinning_keeps_the_nearest_and_farthest_sightings() {
     let sightings: Vec<Sighting> = (0..1000_u32)
         .flat_map(|point| (0..400_u32).map(move |view| Sighting { point, view, range: f64::from(view) }))
         .collect();
@@ -136,7 +136,7 @@ fn the_number_of_observations_is_bounded_and_near_and_far_stay() {
 }
 
 #[test]
-fn indices_must_be_one_a_view() {
+fn scene_views_must_have_one_index_per_view() {
     let source = InMemory::plain(vec![view("a", 2.0)], grey(99));
     let error = observe(&Points::default(), &source, &[]).unwrap_err().to_string();
     assert!(error.contains("1 views have 0 indices"), "{error}");
@@ -144,7 +144,7 @@ fn indices_must_be_one_a_view() {
 }
 
 #[test]
-fn the_water_of_a_synthetic_dive_is_found_with_tracks_and_without() {
+fn water_of_a_synthetic_dive_is_found_with_or_without_tracks() {
     let folder = tempfile::tempdir().unwrap();
     let options = SynthOptions { views: 36, width: 120, height: 90, ..SynthOptions::default() };
     synthesise(folder.path(), &options, |_, _| ()).unwrap();
@@ -170,11 +170,10 @@ fn the_water_of_a_synthetic_dive_is_found_with_tracks_and_without() {
     let (tracked, projected) = (estimate(true), estimate(false));
     for (name, prior) in [("tracks", &tracked), ("projection", &projected)] {
         for c in 0..3 {
-            // 0.014, 0.01 and 0.01 are what edges and texture at 120 pixels leave of accuracy, with some
-            // room.
+            // 0.014 is the accuracy that edges and texture leave at 120 pixels, with some margin.
             let (found, truth) = (prior.water.beta_d[c], Water::COASTAL.beta_d[c]);
             assert!((found - truth).abs() < 0.014, "{name}: beta_d {found} for {truth}");
-            // Backscatter at 4 m, where the points are, is told better than its two numbers.
+            // Backscatter at 5 units, near the points, is determined better than its two parameters.
             let veil = |water: &Water| water.apply(DVec3::ZERO, 5.0)[c];
             let (found, truth) = (veil(&prior.water), veil(&Water::COASTAL));
             assert!((found - truth).abs() < 0.006, "{name}: backscatter {found} for {truth}");

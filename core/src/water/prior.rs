@@ -1,10 +1,10 @@
-//! What the photographs tell of the water before a run: sparse points that are seen from several ranges, open
-//! water, and the darkest pixels at each range.
+//! Estimates the water from the photographs before a run: from sparse points at several ranges, open water,
+//! and the darkest pixels at each range.
 //!
-//! Sparse points come first: where they know a channel, what they say stands. Open water gives its own colour
-//! by direction. Where the points know neither growth nor limit of the backscatter of a channel, the darkest
-//! pixels do. Attenuation is then what the points show once that veil is taken away, reconciled with the hue
-//! that the scene loses with range.
+//! Sparse points take precedence: a channel that they determine keeps their values. Open water gives its own
+//! colour by direction. If the points determine neither growth nor limit of a channel's backscatter, the
+//! darkest pixels do. The attenuation is then estimated from the points after removing that veil, and
+//! reconciled with the hue that the scene loses with range.
 
 use glam::DVec3;
 
@@ -17,31 +17,30 @@ use crate::Result;
 use crate::scene::Points;
 use crate::views::ViewSource;
 
-/// Rounds in which veil and attenuation follow each other.
+/// Alternating updates of veil and attenuation.
 const ROUNDS: usize = 4;
 
-/// What the photographs tell.
+/// The water estimate from the photographs.
 #[derive(Clone, Debug)]
 pub struct Prior {
-    /// What the sparse points tell by themselves, or why they tell nothing.
+    /// The estimate from sparse points alone, or why there is none.
     pub sparse: std::result::Result<SparsePrior, SparsePriorError>,
-    /// Open water, where photographs show it.
+    /// Open water, if photographs show it.
     pub open: Option<OpenWater>,
-    /// The nine numbers by all of it; `None` where nothing tells.
+    /// The water parameters from all evidence; `None` without any.
     pub water: Option<Water>,
-    /// Their standard errors in the order of SMP-UWGS eq. 8; infinite where nothing tells a number.
+    /// Their standard errors in the order of SMP-UWGS eq. 8; infinite for undetermined parameters.
     pub standard_error: [f64; 9],
-    /// How the colour of open water changes with direction, where that was seen.
+    /// Change of the open-water colour with direction, if it was observed.
     pub by_direction: Option<ByDirection>,
-    /// Channels whose veil is by the darkest pixels.
+    /// Channels whose veil comes from the darkest pixels.
     pub by_darkness: [bool; 3],
-    /// For each point that was looked at, its index in the scene, and its J, linear light, at least 0, where
-    /// it is known.
+    /// For each point used, its index in the scene and, if known, its J, linear light, at least 0.
     pub clear: Vec<(u32, Option<[f64; 3]>)>,
 }
 
-/// What the photographs of `source` tell of the water; `scene_views` as [`observe`] takes them.
-/// `beyond_points`: whether pixels beside the sparse points are looked at.
+/// Estimates the water from the photographs of `source`; `scene_views` as in [`observe`]. `beyond_points`
+/// enables the use of pixels away from the sparse points.
 ///
 /// # Errors
 /// When a photograph cannot be read.
@@ -86,14 +85,14 @@ fn beyond(
     darkness: &Darkness<'_>,
     mut observed: Observed,
 ) -> Result<Prior> {
-    // The points know the veil of a channel where they know its growth and its limit.
+    // The points determine a channel's veil if its growth and its limit have finite errors.
     let is_known =
         |c: usize| sparse.standard_error[3 + c].is_finite() && sparse.standard_error[6 + c].is_finite();
     let mut slopes = darkness.open.map_or([DVec3::ZERO; 3], OpenWater::slopes);
     let (mut water, mut errors) = (sparse.water, sparse.standard_error);
     let mut clear = None;
     if darkness.open.is_some() && (0..3).any(is_known) {
-        // The points once more, under a water that changes with direction.
+        // Repeats the estimate from points with a water that changes with direction.
         observed.tint(&darkness.by_direction(slopes));
         if let Ok(found) = sparse_prior(&observed.observations, observed.points.len()) {
             (water, errors) = (found.water, found.standard_error);
@@ -129,7 +128,7 @@ fn beyond(
         }
     }
     if let Some(open) = darkness.open {
-        // Seen at infinite range: no other observation is as direct.
+        // No other observation of `b_inf` is as direct as one at infinite range.
         let (colour, error) = open.colour();
         for c in (0..3).filter(|&c| !by_darkness[c]) {
             (water.b_inf[c], errors[6 + c]) = (colour[c], error[c]);
@@ -151,8 +150,7 @@ fn beyond(
     })
 }
 
-/// J of each point as the mean of what its observations say under `water`, each counting as its light comes
-/// through.
+/// J of each point as the mean over its observations under `water`, weighted by transmitted light.
 fn clear_of(observed: &Observed, water: &Water) -> Vec<Option<[f64; 3]>> {
     let mut sums = vec![([0.0; 3], [0.0; 3]); observed.points.len()];
     for seen in &observed.observations {
@@ -178,7 +176,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn points_and_open_water_together_tell_a_water_that_changes_with_direction() {
+    fn points_and_open_water_give_a_water_by_direction() {
         let truth = brighter_upwards();
         let dive = dive(ahead, |ray| truth.along(&WATER, ray).b_inf);
         let prior = water_prior(&dive.points, &dive.photographs, &ALL, true).unwrap();
@@ -187,11 +185,11 @@ mod tests {
         for direction in
             [middle, DVec3::new(0.1, -0.1, 1.0).normalize(), DVec3::new(-0.1, 0.1, 1.0).normalize()]
         {
-            let (told, expected) =
+            let (found, expected) =
                 (by_direction.along(&water, direction).b_inf, truth.along(&WATER, direction).b_inf);
             for c in 0..3 {
-                let off = (told[c] / expected[c]).ln().abs();
-                assert!(off < 0.05, "channel {c} along {direction}: {told:?} for {expected:?}");
+                let off = (found[c] / expected[c]).ln().abs();
+                assert!(off < 0.05, "channel {c} along {direction}: {found:?} for {expected:?}");
             }
         }
         assert!(prior.standard_error[6..].iter().all(|error| error.is_finite()));
@@ -200,7 +198,7 @@ mod tests {
     }
 
     #[test]
-    fn where_all_views_stand_in_one_place_the_darkest_pixels_tell_the_veil() {
+    fn darkest_pixels_give_the_veil_if_views_share_one_place() {
         let beside = |k: f64| (DVec3::new(0.15 * k, 0.0, -6.0), DVec3::new(0.15 * k, 0.9, 6.0));
         let dive = dive(beside, |_| WATER.b_inf);
         let prior = water_prior(&dive.points, &dive.photographs, &ALL, true).unwrap();
@@ -219,7 +217,7 @@ mod tests {
     }
 
     #[test]
-    fn without_a_look_beyond_the_points_the_prior_is_theirs() {
+    fn prior_of_points_alone_is_the_sparse_estimate() {
         let dive = dive(ahead, |_| WATER.b_inf);
         let prior = water_prior(&dive.points, &dive.photographs, &ALL, false).unwrap();
         assert_eq!(prior.water, prior.sparse.as_ref().ok().map(|found| found.water));

@@ -1,5 +1,5 @@
-//! What a job says of its water: the content of `water.json`, which every model under water carries in its
-//! header too.
+//! The water of a job as stored: the content of `water.json`, which every underwater model also carries in
+//! its header.
 
 use serde::{Deserialize, Serialize};
 
@@ -9,19 +9,19 @@ use crate::{CoreError, Result};
 
 /// Version of [`WaterRecord`].
 const FORMAT: u32 = 2;
-/// What the record says of the formula, without and with a refinement.
+/// The formula in the record, without and with range modulation.
 const CONSTANT: &str = "I = J*exp(-beta_d*r) + b_inf*(1-exp(-beta_b*r)), linear light, r = distance along the ray in \
                         scene units";
 const REFINED: &str = "I = J*exp(-m_d*beta_d*r) + b_inf*(1-exp(-m_b*beta_b*r)), m = scale*sigmoid(w*r/unit + b) with \
                        [w, b] of attenuation for m_d and of backscatter for m_b, linear light, r = expected distance \
                        along the ray of the pixel in scene units";
-/// What the line of a header begins with.
+/// Start of the header line.
 const COMMENT: &str = "fathom_water ";
 
-/// Three numbers, red, green and blue; `None` is what cannot be told.
+/// Three values, red, green and blue; `None` if undetermined.
 pub type Known = [Option<f64>; 3];
 
-/// Standard errors of the nine numbers.
+/// Standard errors of the water parameters.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct StandardErrors {
@@ -34,28 +34,28 @@ pub struct StandardErrors {
 }
 
 impl StandardErrors {
-    /// From nine numbers in the order of eq. 8, where what is not finite cannot be told.
+    /// From nine values in the order of eq. 8; non-finite ones are undetermined.
     pub fn from_array(errors: [f64; 9]) -> Self {
         let known = |i: usize| std::array::from_fn(|c| Some(errors[i + c]).filter(|error| error.is_finite()));
         Self { beta_d: known(0), beta_b: known(3), b_inf: known(6) }
     }
 
-    /// The nine in the order of eq. 8; infinite where it cannot be told.
+    /// All nine in the order of eq. 8; infinite if undetermined.
     pub fn to_array(&self) -> [f64; 9] {
         std::array::from_fn(|i| [self.beta_d, self.beta_b, self.b_inf][i / 3][i % 3].unwrap_or(f64::INFINITY))
     }
 }
 
-/// The water of a job and where it comes from. Its JSON is `water.json`.
+/// The water of a job and its source. Its JSON is `water.json`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(try_from = "Written", into = "Written")]
 pub struct WaterRecord {
     /// Version of this layout: 2.
     pub format: u32,
-    /// The formula, for who reads the file alone.
+    /// The formula, for readers of the file.
     pub image_formation: String,
-    /// Where the water acts, and in which light Gaussians are blended; the file has two keys for it, `medium`
-    /// and `blend`.
+    /// Where the water acts, and in which light Gaussians are blended. The file stores it in two keys,
+    /// `medium` and `blend`.
     pub composition: Composition,
     /// Attenuation of the direct signal, red, green, blue, 1/scene unit of the input.
     pub beta_d: [f64; 3],
@@ -63,32 +63,35 @@ pub struct WaterRecord {
     pub beta_b: [f64; 3],
     /// Colour of the water at infinity, linear light, sRGB primaries.
     pub b_inf: [f64; 3],
-    /// One standard error of each by the sparse points, open water and the darkest pixels; of what the
-    /// network said its standard deviation over the views together with the distance to the sparse points; of
-    /// a consensus by the spread of the partitions too. Null where they cannot tell.
+    /// One standard error of each parameter, from the sparse points, open water and the darkest pixels. For a
+    /// network it is the standard deviation over the views, combined with the distance to the sparse
+    /// estimate. For a consensus it includes the spread of the partitions. Null if undetermined.
     pub standard_error: StandardErrors,
-    /// What the numbers come from: `sparse` (points seen from several distances, open water and the darkest
-    /// pixels), `fixed` (the configuration), `network` (WaterParamPredict: its mean over the training views),
-    /// `descended` (one of these, and moved with the model since, each in proportion to the variance that the
-    /// sparse points gave it), `consensus` (of the partitions, each of which went on from those of the global
-    /// stage; `water.json` then also has `partitions`, a list of [`PartitionWater`](super::PartitionWater)).
+    /// Source of the parameters:
+    /// - `sparse`: points seen from several distances, open water and the darkest pixels;
+    /// - `fixed`: the configuration;
+    /// - `network`: WaterParamPredict, its mean over the training views;
+    /// - `descended`: one of these, optimised with the model, each parameter in proportion to its variance in
+    ///   the sparse estimate;
+    /// - `consensus`: combined from the partitions, which started from the global stage. `water.json` then
+    ///   also has `partitions`, a list of [`PartitionWater`](super::PartitionWater).
     pub source: String,
-    /// Metres in a scene unit; null where nobody knows.
+    /// Metres per scene unit; null if unknown.
     pub metres_per_unit: Option<f64>,
-    /// The coefficients in 1/m where that is known.
+    /// `beta_d` in 1/m; null if `metres_per_unit` is unknown.
     pub beta_d_per_m: Option<[f64; 3]>,
-    /// The same.
+    /// `beta_b` in 1/m; null if `metres_per_unit` is unknown.
     pub beta_b_per_m: Option<[f64; 3]>,
-    /// Factors on the coefficients, 1/m too, by the range of a pixel in scene units (eq. 9); absent where
-    /// there are none.
+    /// Factors on the coefficients (also on those in 1/m), by the range of a pixel in scene units (eq. 9);
+    /// absent if there are none.
     pub refinement: Option<RangeModulation>,
-    /// How `b_inf` changes with direction: factors on it; absent where it is the same in all directions.
+    /// Factors on `b_inf` by direction; absent if it is the same in all directions.
     pub by_direction: Option<ByDirection>,
-    /// Whether photographs show open water for certain; absent where nobody looked.
+    /// Whether photographs show open water with certainty; absent if they were not searched.
     pub shows_open_water: Option<bool>,
 }
 
-/// A [`WaterRecord`] as its JSON has it.
+/// The JSON form of a [`WaterRecord`].
 #[derive(Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Written {
@@ -160,7 +163,7 @@ impl TryFrom<Written> for WaterRecord {
 }
 
 impl WaterRecord {
-    /// Of a water whose numbers come from `source`; `metres_per_unit` of 0 is unknown.
+    /// A record of `water` with parameters from `source`; a `metres_per_unit` of 0 means unknown.
     pub fn new(
         water: &Water,
         composition: Composition,
@@ -188,31 +191,31 @@ impl WaterRecord {
         }
     }
 
-    /// The same with a colour of open water that changes with direction.
+    /// Sets the change of the open-water colour with direction.
     #[must_use]
     pub fn with_direction(self, by_direction: Option<ByDirection>) -> Self {
         Self { by_direction, ..self }
     }
 
-    /// The same with coefficients that follow from range.
+    /// Sets the dependence of the coefficients on range.
     #[must_use]
     pub fn with_refinement(self, refinement: Option<RangeModulation>) -> Self {
         let formula = if refinement.is_some() { REFINED } else { CONSTANT };
         Self { image_formation: formula.to_owned(), refinement, ..self }
     }
 
-    /// The nine numbers as they are at the usual viewing distance: where coefficients follow from range, what
-    /// is to be compared with those of another water.
+    /// The water parameters at the scene scale, for comparison with other waters when coefficients depend on
+    /// range.
     pub fn usual_water(&self) -> Water {
         self.refinement.map_or(self.water(), |refinement| refinement.at(&self.water(), refinement.unit))
     }
 
-    /// The nine numbers.
+    /// The water parameters.
     pub fn water(&self) -> Water {
         Water { beta_d: self.beta_d, beta_b: self.beta_b, b_inf: self.b_inf }
     }
 
-    /// The line that a model's header carries, without the word `comment`.
+    /// The line in a model's header, without the word `comment`.
     ///
     /// # Errors
     /// When the record cannot be written as JSON.
@@ -222,15 +225,15 @@ impl WaterRecord {
         Ok(format!("{COMMENT}{json}"))
     }
 
-    /// Whether a comment of a model's header holds a water.
+    /// Whether a header comment holds a water.
     pub fn is_in(comment: &str) -> bool {
         comment.starts_with(COMMENT)
     }
 
-    /// The record among the comments of a header; `None` where there is none.
+    /// The record among the comments of a header; `None` if there is none.
     ///
     /// # Errors
-    /// When there is one that this program cannot read.
+    /// When the record is malformed or has an unsupported format.
     pub fn among(comments: &[String]) -> Result<Option<Self>> {
         let Some(json) = comments.iter().find_map(|comment| comment.strip_prefix(COMMENT)) else {
             return Ok(None);
@@ -238,17 +241,17 @@ impl WaterRecord {
         let refuse = |why: String| CoreError::Scene(format!("the water in the model's header: {why}"));
         let record: Self = serde_json::from_str(json).map_err(|error| refuse(error.to_string()))?;
         if record.format != FORMAT {
-            return Err(refuse(format!("it has format {}, and this program reads {FORMAT}", record.format)));
+            return Err(refuse(format!("it has format {}; this program reads {FORMAT}", record.format)));
         }
         if !record.water().is_physical() {
-            return Err(refuse(format!("its numbers are none that a water can have: {:?}", record.water())));
+            return Err(refuse(format!("its water parameters are not physical: {:?}", record.water())));
         }
         if let Some(refinement) = &record.refinement
             && !(refinement.is_sound() && record.composition.acts_on_pixels())
         {
             return Err(refuse(format!(
-                "its refinement must have finite numbers and act on pixels; it is {refinement:?} in a water that acts \
-                 {:?}",
+                "its refinement must have finite numbers and act on pixels; it is {refinement:?}, and the water acts \
+                 on {:?}",
                 record.composition.medium()
             )));
         }
@@ -281,19 +284,19 @@ mod tests {
     }
 
     #[test]
-    fn a_record_survives_the_header_of_a_model_to_the_last_bit() {
+    fn record_in_a_model_header_is_read_back_bit_for_bit() {
         let comment = record().to_comment().unwrap();
         assert!(!comment.contains('\n'));
         let found = WaterRecord::among(&["by a program".to_owned(), comment]).unwrap().unwrap();
         assert_eq!(found, record());
-        assert_eq!(found.standard_error.b_inf[2], None, "what cannot be told is null");
+        assert_eq!(found.standard_error.b_inf[2], None, "undetermined errors are null");
         assert!(found.standard_error.to_array()[8].is_infinite());
         assert_eq!(found.beta_d_per_m.unwrap()[0], 0.32, "half a metre a unit");
         assert_eq!(WaterRecord::among(&["fathom".to_owned()]).unwrap(), None);
     }
 
     #[test]
-    fn what_is_blended_over_black_says_so_and_has_its_water_on_pixels() {
+    fn record_over_black_must_have_its_water_on_pixels() {
         let over_black = WaterRecord { composition: Composition::PixelsOverBlack, ..record() };
         let comment = over_black.to_comment().unwrap();
         assert!(comment.contains(r#""blend":"over_black""#), "{comment}");
@@ -306,7 +309,7 @@ mod tests {
     }
 
     #[test]
-    fn a_refinement_travels_with_the_record_and_its_absence_is_the_identity() {
+    fn refinement_is_stored_and_its_absence_is_the_identity() {
         let refinement = RangeModulation::identity(2.0, 3.2).with_array([0.1, -0.25, 1.0 / 3.0, 0.7]);
         let refined = WaterRecord { composition: Composition::PixelsSrgb, ..record() }
             .with_refinement(Some(refinement));
@@ -315,18 +318,18 @@ mod tests {
         assert!(found.image_formation.contains("sigmoid"));
         assert_eq!(found.usual_water(), refinement.at(&Water::COASTAL, 3.2));
         assert_eq!(record().usual_water(), Water::COASTAL);
-        // As records were written before there were refinements.
+        // Records from before range modulation have no such key.
         assert!(!record().to_comment().unwrap().contains("refinement"));
         let on_gaussians = record().with_refinement(Some(refinement)).to_comment().unwrap();
         assert!(WaterRecord::among(&[on_gaussians]).unwrap_err().to_string().contains("act on pixels"));
     }
 
     #[test]
-    fn a_colour_by_direction_travels_with_the_record_and_must_be_sound() {
+    fn colour_by_direction_is_stored_and_must_be_sound() {
         let by_direction =
             ByDirection { middle: [0.0, 0.0, 1.0], slopes: [[0.0, -1.0 / 3.0, 0.0]; 3], most: 0.7 };
-        let told = record().with_direction(Some(by_direction));
-        assert_eq!(WaterRecord::among(&[told.to_comment().unwrap()]).unwrap(), Some(told));
+        let directed = record().with_direction(Some(by_direction));
+        assert_eq!(WaterRecord::among(&[directed.to_comment().unwrap()]).unwrap(), Some(directed));
         assert!(!record().to_comment().unwrap().contains("by_direction"));
         let broken = record().with_direction(Some(ByDirection { most: -1.0, ..by_direction }));
         let error = WaterRecord::among(&[broken.to_comment().unwrap()]).unwrap_err().to_string();
@@ -334,7 +337,7 @@ mod tests {
     }
 
     #[test]
-    fn a_record_that_cannot_be_read_is_refused_with_the_reason() {
+    fn unreadable_record_is_refused_with_the_reason() {
         let refused = |json: &str| WaterRecord::among(&[format!("{COMMENT}{json}")]).unwrap_err().to_string();
         assert!(refused("{").contains("header"));
         let mut other = record();
@@ -344,6 +347,6 @@ mod tests {
         }
         let mut unphysical = record();
         unphysical.beta_d[1] = -1.0;
-        assert!(refused(&serde_json::to_string(&unphysical).unwrap()).contains("none that a water can have"));
+        assert!(refused(&serde_json::to_string(&unphysical).unwrap()).contains("not physical"));
     }
 }

@@ -1,4 +1,4 @@
-//! Coefficients that follow from the range of a pixel (DBDR, SMP-UWGS eq. 9).
+//! Coefficients that depend on the range of a pixel (DBDR, SMP-UWGS eq. 9).
 
 use serde::{Deserialize, Serialize};
 
@@ -6,16 +6,16 @@ use super::Water;
 
 /// The shared predictor of eq. 9: two factors on the coefficients of all channels, by the range of a pixel.
 ///
-/// `m = ReLU(scale * sigmoid(w * r / unit + b))`, r the expected distance along the ray in scene units;
-/// `beta_d` is multiplied by the m of `attenuation`, `beta_b` by that of `backscatter`. A 1 x 1 convolution
-/// over the range image, as in the released code and SeaSplat; `scale` is above 0, so the ReLU changes
-/// nothing.
+/// `m = ReLU(scale * sigmoid(w * r / unit + b))`, with r the expected distance along the ray in scene units.
+/// `beta_d` is multiplied by the m of `attenuation`, `beta_b` by that of `backscatter`. This is a 1 x 1
+/// convolution over the range image, as in the released code and SeaSplat. `scale` is above 0, so the ReLU
+/// has no effect.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RangeModulation {
-    /// Greatest factor.
+    /// Largest factor.
     pub scale: f64,
-    /// Scene units of the input in which range is counted: the usual viewing distance.
+    /// Unit of range, in scene units of the input: the scene scale.
     pub unit: f64,
     /// Weight and bias of the factor on `beta_d`.
     pub attenuation: [f64; 2],
@@ -24,9 +24,9 @@ pub struct RangeModulation {
 }
 
 impl RangeModulation {
-    /// The one that changes nothing; `scale` is above 1.
+    /// The identity modulation; `scale` is above 1.
     pub fn identity(scale: f64, unit: f64) -> Self {
-        // 0 where the scale is 2.
+        // `+ 0.0` turns -0 into 0 for a scale of 2.
         let bias = -(scale - 1.0).ln() + 0.0;
         Self { scale, unit, attenuation: [0.0, bias], backscatter: [0.0, bias] }
     }
@@ -35,13 +35,13 @@ impl RangeModulation {
     pub fn factors(&self, range: f64) -> [f64; 2] {
         let z = range / self.unit;
         [self.attenuation, self.backscatter].map(|[weight, bias]| {
-            // As in the shader, so that infinities do not meet.
+            // Clamped as in the shader, so that infinities never meet.
             let x = (weight * z + bias).clamp(-30.0, 30.0);
             (self.scale / (1.0 + (-x).exp())).max(0.0)
         })
     }
 
-    /// `water` as it is at `range`, scene units.
+    /// The water at `range`, scene units.
     pub fn at(&self, water: &Water, range: f64) -> Water {
         let [on_d, on_b] = self.factors(range);
         Water {
@@ -51,19 +51,19 @@ impl RangeModulation {
         }
     }
 
-    /// Weights and biases in the order of the device: those of `attenuation`, those of `backscatter`.
+    /// Weights and biases in device order: `attenuation`, then `backscatter`.
     pub fn to_array(&self) -> [f64; 4] {
         let ([a, b], [c, d]) = (self.attenuation, self.backscatter);
         [a, b, c, d]
     }
 
-    /// The same with other weights and biases, in the order of [`RangeModulation::to_array`].
+    /// Replaces weights and biases, in the order of [`RangeModulation::to_array`].
     #[must_use]
     pub fn with_array(self, [a, b, c, d]: [f64; 4]) -> Self {
         Self { attenuation: [a, b], backscatter: [c, d], ..self }
     }
 
-    /// Whether all numbers are finite, and scale and unit above 0.
+    /// Whether all values are finite, and scale and unit are above 0.
     pub fn is_sound(&self) -> bool {
         let all = self.to_array().into_iter().chain([self.scale, self.unit]);
         all.into_iter().all(f64::is_finite) && self.scale > 0.0 && self.unit > 0.0
@@ -75,7 +75,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_refinement_starts_as_the_identity_and_stays_between_0_and_its_scale() {
+    fn modulation_starts_as_identity_and_stays_within_its_scale() {
         for scale in [1.5, 2.0, 5.0] {
             let start = RangeModulation::identity(scale, 3.2);
             for range in [0.0, 0.7, 40.0] {
@@ -97,7 +97,7 @@ mod tests {
     }
 
     #[test]
-    fn numbers_that_no_refinement_has_are_told_apart() {
+    fn broken_range_modulations_are_not_sound() {
         let sound = RangeModulation::identity(2.0, 1.0);
         assert!(sound.is_sound());
         let faults = [

@@ -1,10 +1,9 @@
-//! Symmetric systems of three unknowns, for fits that may leave some of them open.
+//! Symmetric systems with three unknowns, for fits that may leave some undetermined.
 
 /// Rows of a symmetric matrix.
 pub(super) type Matrix = [[f64; 3]; 3];
 
-/// x of `matrix x = right`, by Gaussian elimination with pivots; 0 for an unknown that the matrix says
-/// nothing of.
+/// Solves `matrix x = right` by Gaussian elimination with pivoting; 0 for an undetermined unknown.
 pub(super) fn solve(mut matrix: Matrix, mut right: [f64; 3]) -> [f64; 3] {
     let mut row_of = [None; 3];
     let mut used = [false; 3];
@@ -29,15 +28,16 @@ pub(super) fn solve(mut matrix: Matrix, mut right: [f64; 3]) -> [f64; 3] {
     std::array::from_fn(|column| row_of[column].map_or(0.0, |row| right[row] / matrix[row][column]))
 }
 
-/// Variances of three numbers of order 1 under the information `hessian`: the larger of its inverse and of
-/// the sandwich with `scatter`, the sum of outer products of the clusters' gradients.
+/// Variances of three parameters of order 1 with the information matrix `hessian`. Each is the larger of two
+/// estimates: the inverse of `hessian`, and the sandwich with `scatter`, the sum of outer products of the
+/// clusters' gradients.
 ///
-/// A weak prior (standard deviation 10) stands in for what the observations leave open, so that such a number
-/// comes out with a variance near 100 and does not spoil the others.
+/// A weak prior (standard deviation 10) covers undetermined parameters. Such a parameter gets a variance near
+/// 100 and does not affect the others.
 pub(super) fn covariance(mut hessian: Matrix, scatter: Matrix) -> [f64; 3] {
     const PRIOR: f64 = 0.01;
     (0..3).for_each(|k| hessian[k][k] += PRIOR);
-    // Scaled to a unit diagonal: information of numbers may differ by ten orders of magnitude.
+    // Scaled to a unit diagonal, since the information can differ by ten orders of magnitude.
     let scale = [0, 1, 2].map(|k| hessian[k][k].sqrt());
     let scaled = |matrix: &Matrix| -> Matrix {
         std::array::from_fn(|j| std::array::from_fn(|k| matrix[j][k] / (scale[j] * scale[k])))
@@ -60,7 +60,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_system_is_solved_and_what_it_leaves_open_stays_zero() {
+    fn undetermined_unknowns_of_a_system_are_zero() {
         let matrix = [[0.0, 2.0, 1.0], [2.0, 1.0, 0.0], [1.0, 0.0, 3.0]];
         let x = [0.5, -1.0, 2.0];
         let right = std::array::from_fn(|j| (0..3).map(|k| matrix[j][k] * x[k]).sum());
@@ -70,7 +70,7 @@ mod tests {
     }
 
     #[test]
-    fn an_open_number_has_a_large_variance_and_leaves_the_others_theirs() {
+    fn undetermined_parameter_does_not_affect_other_variances() {
         let hessian = [[1e8, 0.0, 2e3], [0.0; 3], [2e3, 0.0, 1e4]];
         let variance = covariance(hessian, [[0.0; 3]; 3]);
         assert!((variance[1] - 100.0).abs() < 1e-9);
@@ -78,7 +78,7 @@ mod tests {
             (variance[0] * 1e8 - 1.0).abs() < 0.01 && (variance[2] * 1e4 - 1.0).abs() < 0.01,
             "{variance:?}"
         );
-        // Gradients of clusters that scatter four times as much as they should.
+        // Cluster gradients with four times the expected scatter.
         let variance = covariance(hessian, hessian.map(|row| row.map(|value| 4.0 * value)));
         assert!((variance[0] * 1e8 - 4.0).abs() < 0.01, "{variance:?}");
     }

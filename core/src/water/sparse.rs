@@ -1,26 +1,28 @@
-//! The water from sparse points that are seen from several distances.
+//! Estimates the water from sparse points that are seen from several distances.
 //!
 //! Per channel (Akkaynak & Treibitz, CVPR 2018), for point i in view j at range r along the ray, linear
-//! light: `I_ij = J_i exp(-beta_d r_ij) + b_inf (1 - exp(-beta_b r_ij))`. The same J at several r fixes the
-//! three numbers of a channel; each J enters linearly, at least 0, and is eliminated (variable projection;
-//! Golub & Pereyra 1973, with Kaufman's Jacobian). What is left is least squares in three numbers:
-//! Levenberg-Marquardt in the unconstrained numbers of [`Water::to_raw`], from nine starts.
+//! light: `I_ij = J_i exp(-beta_d r_ij) + b_inf (1 - exp(-beta_b r_ij))`. Observing the same J at several r
+//! determines the three parameters of a channel. Each J enters linearly, is at least 0, and is eliminated
+//! (variable projection; Golub & Pereyra 1973, with Kaufman's Jacobian). The remaining least-squares problem
+//! has three unknowns. Levenberg-Marquardt solves it in the unconstrained parameters of [`Water::to_raw`],
+//! from nine starts.
 //!
-//! - **Noise** is estimated with the water: variance = c0 s² + c1 m + c2 (J exp(-beta_d r))², with m the
-//!   modelled colour and s what one 8-bit code is worth there. The terms are quantisation and compression,
-//!   photons, and texture: what is beside the point is seen too, and fades with the direct signal. Weights
-//!   hang on the model, never on the observed colour, whose noise they would share.
-//! - **Outliers** (occlusion, edges, fish) get Tukey's biweight, and a point whose residuals are all large
-//!   counts less as a whole (as under Student's t with four degrees of freedom).
-//! - **Rounding** is shared by all observations of one shade, which together weigh as much as one.
-//! - **Errors** are those of a sandwich with points as clusters, since what is wrong with a point is wrong in
-//!   all its views, and with shades as others. Of many observations they are far below what the model leaves
-//!   out, so to their square come those of three measured changes: how far the numbers move under Huber's
-//!   loss, which gives outliers more say (they are one-sided at edges before a darker ground), by how much
-//!   darker and brighter points disagree, and how far the numbers move when less of the scene around each
-//!   point is looked at.
+//! - **Noise** is estimated together with the water: variance = c0 s² + c1 m + c2 (J exp(-beta_d r))², with m
+//!   the modelled colour and s the size of one 8-bit code there. The terms are quantisation and compression,
+//!   photons, and texture: the surroundings of the point are seen too, and fade with the direct signal.
+//!   Weights depend on the model, never on the observed colour, since they would share its noise.
+//! - **Outliers** (occlusion, edges, fish) get Tukey's biweight. A point whose residuals are all large gets
+//!   less weight as a whole (as under Student's t with four degrees of freedom).
+//! - **Rounding** errors are shared by all observations of one shade, which together weigh as much as one.
+//! - **Errors** come from a sandwich estimator. Points are clusters, since an error of a point affects all
+//!   its views; so are shades. With many observations, these errors are far below those of the model itself,
+//!   so the squares of three measured changes are added. The first is the change under Huber's loss, which
+//!   gives outliers more influence (at edges before a darker ground, they are one-sided). The second is the
+//!   difference between darker and brighter points. The third is the change with smaller windows around each
+//!   point.
 //!
-//! Channels are independent. Sums run over fixed chunks in order: the same numbers on any number of threads.
+//! Channels are independent. Sums run over fixed chunks in order, so results do not depend on the number of
+//! threads.
 
 mod estimate;
 mod least_squares;
@@ -36,79 +38,81 @@ use least_squares::Channel;
 use robust::quantile;
 use shades::shades_of;
 
-/// Fewer points with several ranges than this tell nothing.
+/// Minimum number of points with several ranges.
 const MIN_POINTS: usize = 12;
-/// A point counts as seen from several distances where the largest range is this many times the smallest.
+/// A point counts as seen from several distances if its largest range is at least this many times the
+/// smallest.
 const MIN_RATIO: f64 = 1.03;
 
 /// One point in one view.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Observation {
-    /// Which point, from 0.
+    /// Index of the point, from 0.
     pub point: u32,
     /// Distance from the camera's centre, scene units.
     pub range: f64,
-    /// What the photograph shows, linear light, 0..1; NaN in a channel that says nothing, as a saturated one.
+    /// Colour in the photograph, linear light, 0..1; NaN in an unusable channel, such as a saturated one.
     pub colour: [f64; 3],
-    /// The same of a smaller part of the scene around the point: by how much the water is another one then
-    /// tells what blur and texture do to it.
+    /// The same for a smaller window around the point. The difference that it makes to the water shows the
+    /// effect of blur and texture.
     pub finer: [f64; 3],
     /// Unit direction from the camera's centre, scene axes.
     pub direction: [f64; 3],
-    /// Factors on the colour of open water along it: 1 where that is the same in all directions.
+    /// Factors on the open-water colour along the ray: 1 if that colour does not depend on direction.
     pub tint: [f64; 3],
 }
 
-/// A water with its errors, and what it was made from.
+/// A water with its errors and statistics of the data behind it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SparsePrior {
-    /// The nine numbers. Where errors are infinite, `b_inf` is at most the median colour of the farthest
-    /// observations, and a `beta_b` that would be above the inverse of the median range is `beta_d`.
+    /// The water parameters. If the errors are infinite, `b_inf` is at most the median colour of the farthest
+    /// observations. A `beta_b` that would exceed the inverse of the median range is then replaced by
+    /// `beta_d`.
     pub water: Water,
-    /// Standard error of each in the order of SMP-UWGS eq. 8 ([`Water::to_array`]); infinite where the
-    /// observations do not tell the number. Never NaN.
+    /// Standard error of each parameter in the order of SMP-UWGS eq. 8 ([`Water::to_array`]); infinite if the
+    /// observations do not determine it. Never NaN.
     pub standard_error: [f64; 9],
-    /// J of each point by the smaller windows, linear light, at least 0; `None` for a point without an
-    /// observation that counts in some channel.
+    /// J of each point from the smaller windows, linear light, at least 0; `None` for a point that lacks
+    /// usable observations in any channel.
     pub clear: Vec<Option<[f64; 3]>>,
-    /// Points that were seen from several distances.
+    /// Number of points seen from several distances.
     pub points: usize,
-    /// Observations of the channel that has the most.
+    /// Number of observations of the channel that has the most.
     pub observations: usize,
-    /// Share of the observations within Tukey's limit, of the channel with the fewest.
+    /// Share of the observations within Tukey's limit, for the channel where it is lowest.
     pub inliers: f64,
     /// Ranges of the observations, scene units: 5th percentile, median, 95th percentile.
     pub ranges: [f64; 3],
-    /// Median over points of the largest range by the smallest.
+    /// Median over points of the ratio of the largest to the smallest range.
     pub range_ratio: f64,
 }
 
-/// Why there is no [`SparsePrior`].
+/// Why no [`SparsePrior`] was found.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum SparsePriorError {
-    /// Next to nothing was observed.
+    /// Too few points were observed.
     #[error(
-        "the water cannot be estimated from sparse points: {points} points are seen by two views or more, and \
+        "the water cannot be estimated from sparse points: {points} points are seen in at least two views, but \
          {MIN_POINTS} are needed; reconstruct with more features or give the water with water.prior"
     )]
     TooFewPoints {
         /// Points with two observations or more.
         points: usize,
     },
-    /// Every point is seen from one distance, so whatever the water does may as well be its colour.
+    /// Every point is seen from one distance only, so the water cannot be separated from its colour.
     #[error(
-        "the water cannot be estimated from sparse points: of {points} points {spread} are seen from distances \
-         that differ by 3 % or more, and {MIN_POINTS} are needed; add photographs from nearer or farther, or give \
+        "the water cannot be estimated from sparse points: {spread} of {points} points are seen from distances \
+         that differ by at least 3 %, but {MIN_POINTS} are needed; add photographs from nearer or farther, or give \
          the water with water.prior"
     )]
     NoRangeSpread {
         /// Points with two observations or more.
         points: usize,
-        /// Those seen from several distances.
+        /// Number of points seen from several distances.
         spread: usize,
     },
-    /// An observation names a point that is not there.
-    #[error("an observation names point {point}, but there are {points}")]
+    /// An observation refers to a point that does not exist.
+    #[error("an observation refers to point {point}, but there are only {points}")]
     UnknownPoint {
         /// The index.
         point: u32,
@@ -123,12 +127,12 @@ impl From<SparsePriorError> for CoreError {
     }
 }
 
-/// The water of these observations of `points` points, in any order.
+/// Estimates the water from these observations of `points` points, in any order.
 ///
-/// Observations with a range that is not above 0 and finite do not count, nor channels that are not finite.
+/// Ignores observations whose range is not positive and finite, and colour channels that are not finite.
 ///
 /// # Errors
-/// [`SparsePriorError`] where there are too few points or none from several distances.
+/// [`SparsePriorError`] when there are too few points, or too few seen from several distances.
 pub fn sparse_prior(observations: &[Observation], points: usize) -> Result<SparsePrior, SparsePriorError> {
     let (order, unit) = ordered(observations, points)?;
     let key = |index: u32| &observations[index as usize];
@@ -147,8 +151,8 @@ pub fn sparse_prior(observations: &[Observation], points: usize) -> Result<Spars
     let mut ranges: Vec<f64> = order.iter().map(|&index| key(index).range).collect();
     let ranges = [0.05, 0.5, 0.95].map(|share| quantile(&mut ranges, share));
 
-    // Which observations are rounded alike is told by the colours of a first estimate: those observed have
-    // the noise that the weights must not share.
+    // Shades are assigned from the colours of a first estimate: the observed colours contain the noise, which
+    // must not affect the weights.
     let rough: Vec<_> = (0..3)
         .into_par_iter()
         .map(|c| {
@@ -205,13 +209,12 @@ pub fn sparse_prior(observations: &[Observation], points: usize) -> Result<Spars
     })
 }
 
-/// Attenuation alone, under a veil that is known: `beta_b` and `b_inf` of `water` with the tints of the
+/// Estimates the attenuation alone, with a known veil: `beta_b` and `b_inf` of `water` with the tints of the
 /// observations.
 ///
-/// Gives `beta_d`, 1/scene unit, and standard errors, infinite in a channel of which nothing tells. Points
-/// that grow brighter with their range once the veil is taken away have no attenuation: then it is 0, and the
-/// error is at least as large as what they would amplify, since by that much the model does not hold for
-/// them.
+/// Returns `beta_d`, 1/scene unit, and standard errors, infinite in a channel without information. If points
+/// get brighter with range after the veil is removed, the attenuation is 0. The error is then at least as
+/// large as the amplification found, since the model is off by that much for these points.
 ///
 /// # Errors
 /// As [`sparse_prior`].
@@ -236,7 +239,7 @@ pub fn attenuation_under(
     Ok((of(0), of(1)))
 }
 
-/// The observations that count in an order that leaves no trace of that of the input, and their median range.
+/// The usable observations, in an order independent of the input order, and their median range.
 fn ordered(observations: &[Observation], points: usize) -> Result<(Vec<u32>, f64), SparsePriorError> {
     if let Some(stray) = observations.iter().find(|seen| seen.point as usize >= points) {
         return Err(SparsePriorError::UnknownPoint { point: stray.point, points });
@@ -247,7 +250,7 @@ fn ordered(observations: &[Observation], points: usize) -> Result<(Vec<u32>, f64
             range > 0.0 && range.is_finite()
         })
         .collect();
-    // Of one point by range, so that the order of the input leaves no trace in the sums.
+    // By range within a point, so that sums do not depend on the input order.
     let key = |index: u32| &observations[index as usize];
     order.sort_by(|&a, &b| {
         let (a, b) = (key(a), key(b));

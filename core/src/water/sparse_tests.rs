@@ -1,4 +1,4 @@
-//! Known waters are found again, with errors that are honest.
+//! Known waters are recovered, with honest error estimates.
 
 use super::*;
 use crate::picture::{linear_to_srgb, srgb_to_linear};
@@ -18,7 +18,7 @@ struct Made {
 }
 
 /// `points` points, each seen eight times from 2 to 14 units (or all from 5), by a sensor with noise 0.004
-/// sqrt(I); a share of the observations shows anything.
+/// sqrt(I). A share of the observations has random colours.
 fn made(water: &Water, seed: u32, points: u32, outliers: f64, spread: bool) -> Made {
     let draw = |a: u32, b: u32| random_bits(seed, Stream::Test, a, b).map(|bits| f64::from(uniform(bits)));
     let (mut observations, mut clear) = (Vec::new(), Vec::new());
@@ -48,7 +48,7 @@ fn made(water: &Water, seed: u32, points: u32, outliers: f64, spread: bool) -> M
 }
 
 #[test]
-fn known_waters_are_found_under_noise_and_a_tenth_of_outliers() {
+fn known_waters_are_recovered_with_noise_and_outliers() {
     for (name, water) in [("coast", COAST), ("green", GREEN), ("blue", BLUE), ("default", Water::COASTAL)] {
         for seed in [1, 2] {
             let made = made(&water, seed, 1500, 0.1, true);
@@ -59,15 +59,15 @@ fn known_waters_are_found_under_noise_and_a_tenth_of_outliers() {
                 let error = prior.standard_error[k];
                 assert!(error.is_finite() && error > 0.0, "{name}, number {k}: error {error}");
                 let off = (found[k] - truth[k]).abs();
-                // Four errors, since 72 numbers are looked at.
+                // Four standard errors, since 72 values are compared.
                 assert!(
                     off < 4.0 * error,
                     "{name} {seed}, number {k}: {} for {}, error {error}",
                     found[k],
                     truth[k]
                 );
-                // What 12,000 observations can tell: the aims of attenuation 3 %, growth 8 %, colour 0.005,
-                // doubled.
+                // Goals for 12,000 observations: attenuation 3 %, growth 8 %, colour 0.005. The bounds are
+                // twice that.
                 let bound = [0.06 * truth[k], 0.16 * truth[k], 0.01][k / 3];
                 assert!(off < bound, "{name} {seed}, number {k}: {} for {}", found[k], truth[k]);
             }
@@ -76,7 +76,7 @@ fn known_waters_are_found_under_noise_and_a_tenth_of_outliers() {
 }
 
 #[test]
-fn the_truth_lies_within_two_standard_errors_as_often_as_it_should_and_errors_are_not_padded() {
+fn standard_errors_cover_the_truth_and_are_not_padded() {
     let (mut within, mut all, mut half) = (0, 0, 0);
     for seed in 0..40 {
         let made = made(&COAST, 100 + seed, 250, 0.0, true);
@@ -93,13 +93,13 @@ fn the_truth_lies_within_two_standard_errors_as_often_as_it_should_and_errors_ar
     }
     assert!(all > 340, "only {all} of 360 numbers have an error");
     let (within, half) = (f64::from(within) / f64::from(all), f64::from(half) / f64::from(all));
-    // 95 % and 24 % under a normal law. Measured changes are added, so the errors may be up to twice too
+    // 95 % and 24 % under a normal distribution. Measured changes are added, so errors may be up to twice too
     // large.
     assert!(within > 0.92, "{within} within two errors");
     assert!((0.1..0.5).contains(&half), "{half} within 0.3 errors");
 }
 
-/// The colour after a JPEG: luma and chroma in whole codes (BT.601), then red, green and blue in whole codes.
+/// The colour after a JPEG: luma and chroma as whole codes (BT.601), then red, green and blue as whole codes.
 fn stored(colour: [f64; 3]) -> [f64; 3] {
     let [r, g, b] = colour.map(|value| 255.0 * linear_to_srgb(value.clamp(0.0, 1.0)));
     let luma = 0.299 * r + 0.587 * g + 0.114 * b;
@@ -110,11 +110,11 @@ fn stored(colour: [f64; 3]) -> [f64; 3] {
 }
 
 #[test]
-fn what_all_observations_of_open_water_are_rounded_by_bends_nothing_and_stands_in_the_errors() {
+fn shared_rounding_of_open_water_is_covered_by_the_errors() {
     let mut apart = Vec::new();
     for step in 0..4 {
-        // Nearly all light is gone before the farthest points; the colour of open water is at another place
-        // between two codes.
+        // Nearly all light is gone before the farthest points. Each step places the open-water colour
+        // elsewhere between two codes.
         let water = Water {
             beta_d: [0.9, 0.5, 0.6],
             beta_b: [0.8, 0.6, 0.7],
@@ -129,24 +129,24 @@ fn what_all_observations_of_open_water_are_rounded_by_bends_nothing_and_stands_i
         let numbers = prior.water.to_array().into_iter().zip(water.to_array()).zip(prior.standard_error);
         for (number, ((found, truth), error)) in numbers.enumerate() {
             apart.push((found - truth).abs() / error);
-            // An eighth of a code is worth 0.0003.
+            // An eighth of a code is 0.0003.
             assert!(number < 6 || (1e-4..2e-3).contains(&error), "number {number}: error {error}");
         }
     }
-    // Without shades a quarter of the numbers are more than two errors away, some twelve.
+    // Without shades, a quarter of the values are more than two errors off, some by twelve.
     assert!(apart.iter().all(|apart| *apart < 2.5), "{apart:.2?}");
 }
 
 #[test]
-fn what_smaller_windows_change_stands_in_the_errors_and_j_is_theirs() {
+fn smaller_windows_widen_the_errors_and_give_j() {
     let mut made = made(&COAST, 8, 800, 0.02, true);
     let plain = sparse_prior(&made.observations, made.clear.len()).unwrap();
-    // A water that is a tenth stronger, as texture that blurs with range may feign it.
+    // Smaller windows show a stronger attenuation, as texture that blurs with range can.
     for seen in &mut made.observations {
         seen.finer = seen.colour.map(|value| value * (-0.012 * seen.range).exp());
     }
     let prior = sparse_prior(&made.observations, made.clear.len()).unwrap();
-    assert_eq!(prior.water, plain.water, "the numbers are those of the larger windows");
+    assert_eq!(prior.water, plain.water, "the water is that of the larger windows");
     for c in 0..3 {
         let (before, now) = (plain.standard_error[c], prior.standard_error[c]);
         assert!(before < 0.005 && now > 0.008, "channel {c}: {now}, and {before} where windows agree");
@@ -157,14 +157,14 @@ fn what_smaller_windows_change_stands_in_the_errors_and_j_is_theirs() {
 }
 
 #[test]
-fn the_scale_of_the_scene_and_the_order_of_the_observations_leave_no_trace() {
+fn result_does_not_depend_on_scale_order_or_threads() {
     let made = made(&COAST, 5, 400, 0.05, true);
     let base = sparse_prior(&made.observations, 400).unwrap();
     let mut turned = made.observations.clone();
     turned.reverse();
-    assert!(sparse_prior(&turned, 400).unwrap() == base, "the order");
+    assert!(sparse_prior(&turned, 400).unwrap() == base, "order");
     let one = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
-    assert!(one.install(|| sparse_prior(&made.observations, 400).unwrap()) == base, "the threads");
+    assert!(one.install(|| sparse_prior(&made.observations, 400).unwrap()) == base, "threads");
     for scale in [1e-3, 512.0] {
         let scaled: Vec<_> =
             made.observations.iter().map(|o| Observation { range: o.range * scale, ..*o }).collect();
@@ -180,9 +180,9 @@ fn the_scale_of_the_scene_and_the_order_of_the_observations_leave_no_trace() {
 }
 
 #[test]
-fn the_colours_without_water_come_back_with_the_numbers() {
+fn colours_without_water_are_recovered() {
     let mut made = made(&Water::COASTAL, 6, 600, 0.02, true);
-    // Nothing is known of one point, and of another no red.
+    // One point has no observation, and another has no red.
     made.observations.retain(|o| o.point != 7);
     made.observations.iter_mut().filter(|o| o.point == 9).for_each(|o| o.colour[0] = f64::NAN);
     let prior = sparse_prior(&made.observations, 600).unwrap();
@@ -195,12 +195,12 @@ fn the_colours_without_water_come_back_with_the_numbers() {
         .collect();
     assert!(errors.len() > 590);
     let median = quantile(&mut errors, 0.5);
-    // Noise of 0.002 at the camera, once over sqrt(8) and twice through the water.
+    // Noise of 0.002 at the camera, reduced by sqrt(8) and doubled by the water.
     assert!(median < 0.01, "{median}");
 }
 
 #[test]
-fn clear_air_has_no_attenuation_and_a_backscatter_that_nobody_knows() {
+fn clear_air_has_no_attenuation_and_unknown_backscatter() {
     for seed in [1, 2, 3] {
         let made = made(&Water::CLEAR, seed, 800, 0.05, true);
         let prior = sparse_prior(&made.observations, 800).unwrap();
@@ -209,7 +209,7 @@ fn clear_air_has_no_attenuation_and_a_backscatter_that_nobody_knows() {
             assert!(prior.water.beta_d[c] < 0.003, "{:?}", prior.water);
             assert!(prior.standard_error[c] < 0.01, "{:?}", prior.standard_error);
             assert!(prior.standard_error[3 + c].is_infinite(), "{:?}", prior.standard_error);
-            // Whatever stands for the unknown numbers, it makes no veil to speak of.
+            // The values chosen for unknown parameters make a negligible veil.
             let veil = prior.water.apply(DVec3::ZERO, 10.0)[c];
             assert!(veil < 0.01, "{veil} in {:?}", prior.water);
         }
@@ -217,11 +217,10 @@ fn clear_air_has_no_attenuation_and_a_backscatter_that_nobody_knows() {
 }
 
 #[test]
-fn points_that_are_lit_better_from_afar_have_no_veil_before_them() {
+fn points_lit_better_from_afar_get_no_veil() {
     for seed in [1, 2] {
         let mut made = made(&Water::CLEAR, seed, 1500, 0.05, true);
-        // A camera that stands nearer throws more of a shadow: what is bright gains more light than what is
-        // dark.
+        // A nearer camera casts more of a shadow: bright points gain more light than dark ones.
         for observation in &mut made.observations {
             let light = 1.0 + 0.03 * (observation.range - 6.0);
             observation.colour = observation.colour.map(|value| value * light);
@@ -236,7 +235,7 @@ fn points_that_are_lit_better_from_afar_have_no_veil_before_them() {
 }
 
 #[test]
-fn what_cannot_be_told_is_said() {
+fn insufficient_observations_are_reported() {
     assert_eq!(sparse_prior(&[], 0), Err(SparsePriorError::TooFewPoints { points: 0 }));
     let few = made(&COAST, 1, 5, 0.0, true);
     assert_eq!(sparse_prior(&few.observations, 5), Err(SparsePriorError::TooFewPoints { points: 5 }));
@@ -249,7 +248,7 @@ fn what_cannot_be_told_is_said() {
 }
 
 #[test]
-fn bad_observations_stay_finite_and_a_channel_without_any_is_unknown() {
+fn bad_observations_give_finite_or_unknown_parameters() {
     let mut made = made(&COAST, 3, 300, 0.0, true);
     for (index, observation) in made.observations.iter_mut().enumerate() {
         match index % 40 {
@@ -267,7 +266,7 @@ fn bad_observations_stay_finite_and_a_channel_without_any_is_unknown() {
     assert!((prior.water.beta_d[1] / COAST.beta_d[1] - 1.0).abs() < 0.1, "{:?}", prior.water);
     assert!([2, 5, 8].iter().all(|k| prior.standard_error[*k].is_infinite()));
     assert!(prior.clear.iter().all(Option::is_none));
-    // All black, all white, all water.
+    // All black, all white, and all open water.
     for colour in [[0.0; 3], [1.0; 3], COAST.b_inf] {
         let same: Vec<_> = made.observations.iter().map(|o| Observation { colour, ..*o }).collect();
         let prior = sparse_prior(&same, 300).unwrap();

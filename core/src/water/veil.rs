@@ -1,10 +1,10 @@
-//! The veil by the darkest pixels, where sparse points cannot tell it.
+//! Backscatter from the darkest pixels, for scenes whose sparse points do not determine it.
 //!
-//! What is darkest at a range is the backscatter and what little light the darkest of the scene sends
+//! At each range, the darkest pixels show backscatter plus the little light that the darkest surfaces reflect
 //! (SeaThru; Akkaynak & Treibitz, CVPR 2019, eq. 10): per channel `D(r, d) = b_inf(d) (1 - exp(-beta_b r)) +
-//! J_dark exp(-beta_d r)`. It is a bound from above: a class of range that holds nothing dark lies above the
-//! rest, so what is above the model counts less than what is below it. Where photographs show open water, its
-//! colours are observations at infinite range.
+//! J_dark exp(-beta_d r)`. This is an upper bound: a range class without dark surfaces lies above the model.
+//! Residuals above the model therefore get less weight than those below it. Where photographs show open
+//! water, its colours are observations at infinite range.
 
 use glam::DVec3;
 
@@ -12,67 +12,67 @@ use super::dense::{Least, least_squares, solve};
 use super::open_water::{DarkCell, OpenWater};
 use super::{ByDirection, Water};
 
-/// What the logarithm of a dark is off by.
+/// Standard deviation of the logarithm of a dark value.
 const SPREAD: f64 = 0.15;
-/// Share of a residual above the model that counts.
+/// Factor on residuals above the model.
 const ABOVE: f64 = 0.4;
-/// All darks together weigh as much as so many.
+/// Total weight of all dark values, in observations.
 const DARKS: f64 = 60.0;
-/// All observations of open water together weigh as much as so many, each [`OPEN_SPREAD`] off.
+/// Total weight of all open-water observations, in observations with a standard deviation of [`OPEN_SPREAD`].
 const OPENS: f64 = 20.0;
 const OPEN_SPREAD: f64 = 0.05;
-/// How much of the nearest dark is light of the scene: a tenth. By how much this may be wrong is in the
-/// standard errors, by two other shares.
+/// Share of the nearest dark value that is light from the scene: a tenth. Fits with [`OTHER_SHARES`] add the
+/// uncertainty of this share to the standard errors.
 const SHARE: f64 = 0.1;
 const OTHER_SHARES: [f64; 2] = [0.0, 0.3];
 const SHARE_SPREAD: f64 = 0.05;
-/// How far the logarithm of beta_b over beta_d is from 0, where neither darks nor open water tell: waters
-/// have both within a factor of five of each other.
+/// Standard deviation of ln(beta_b / beta_d) as a prior, for when neither dark pixels nor open water
+/// determine it. In real waters, the two are within a factor of five of each other.
 const COUPLED: f64 = 1.5;
-/// How large slopes are where photographs show open water, and where they show none.
+/// Standard deviation of the slopes, with open water in the photographs and without.
 const SLOPES: [f64; 2] = [5.0, 0.5];
-/// Linear light that no photograph tells from black.
+/// Linear light below which a photograph does not differ from black.
 const BLACK: f64 = 5e-4;
-/// Relative errors from which a number is unknown.
+/// Relative error at or above which a parameter is unknown.
 const UNKNOWN: f64 = 1.0;
-/// The darks of a scene in water grow with range: rank correlation, and the farthest third over the nearest.
+/// Under water, dark values grow with range. Minimum rank correlation, and minimum ratio of the median of the
+/// farthest third to that of the nearest.
 const LEAST_CORRELATION: f64 = 0.5;
 const LEAST_GROWTH: f64 = 1.4;
 
-/// Linear light beside the veil from which a class has a hue.
+/// Minimum linear light above the veil at which a class has a usable hue.
 const LEAST_LIGHT: f64 = 2e-3;
-/// Fewer classes tell nothing of hues.
+/// Minimum number of classes for an estimate of hues.
 const LEAST_CLASSES: usize = 24;
-/// By what share of itself, and by how much in 1/unit, a change of hue is the scene's own.
+/// Part of a hue change that may belong to the scene itself: a share of the change, and a constant in 1/unit.
 const HUE_ASTRAY: f64 = 0.3;
 const LEAST_HUE: f64 = 0.05;
 
 /// The veil of one channel.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Veil {
-    /// 1/scene unit, and its standard error; infinite where nothing tells.
+    /// 1/scene unit, and its standard error; infinite if undetermined.
     pub(super) beta_b: [f64; 2],
-    /// Linear light in the middle direction, and its standard error; infinite where nothing tells.
+    /// Linear light in the middle direction, and its standard error; infinite if undetermined.
     pub(super) b_inf: [f64; 2],
     /// Change of the logarithm of the colour by direction, scene axes.
     pub(super) slopes: DVec3,
 }
 
-/// What a veil is found from.
+/// The data from which a veil is estimated.
 pub(super) struct Darkness<'a> {
     pub(super) dark: &'a [DarkCell],
     pub(super) open: Option<&'a OpenWater>,
-    /// Up, right and forward of the levelled frame; the colour is the same in all directions where there is
-    /// none.
+    /// Up, right and forward of the levelled frame. `None`: the colour is the same in all directions.
     pub(super) axes: Option<[DVec3; 3]>,
-    /// Direction of which `b_inf` is told, unit length.
+    /// Direction to which `b_inf` refers, unit length.
     pub(super) middle: DVec3,
-    /// Usual viewing distance, scene units.
+    /// Scene scale, scene units.
     pub(super) unit: f64,
 }
 
 impl Darkness<'_> {
-    /// Whether darks grow with range in some channel, as they do under water and not in air.
+    /// Whether dark values grow with range in any channel, as they do under water but not in air.
     pub(super) fn grow(&self) -> bool {
         (0..3).any(|c| {
             let mut by_range: Vec<(f64, f64)> =
@@ -92,7 +92,8 @@ impl Darkness<'_> {
         })
     }
 
-    /// The veil of channel `c`, whose light fades by `beta_d`, 1/scene unit. `None` without darks.
+    /// The veil of channel `c`, whose light is attenuated by `beta_d`, 1/scene unit. `None` without dark
+    /// cells.
     pub(super) fn veil(&self, c: usize, beta_d: f64) -> Option<Veil> {
         let found = self.fit(c, beta_d, SHARE)?;
         let others: Vec<Least<6>> =
@@ -112,8 +113,8 @@ impl Darkness<'_> {
         })
     }
 
-    /// Unknowns: logarithms of `b_inf` and of `beta_b` in 1/unit, the share of the nearest dark that is light
-    /// of the scene, and slopes along up, right and forward.
+    /// Unknowns: logarithms of `b_inf` and of `beta_b` in 1/unit, the share of the nearest dark value that is
+    /// light from the scene, and slopes along up, right and forward.
     fn fit(&self, c: usize, beta_d: f64, share: f64) -> Option<Least<6>> {
         let nearest = self.nearest(c)?;
         let (unit, axes) = (self.unit, self.axes.unwrap_or([DVec3::ZERO; 3]));
@@ -141,7 +142,8 @@ impl Darkness<'_> {
             }
         };
         let brightest = self.dark.iter().map(|cell| cell.dark[c]).fold(0.01, f64::max);
-        // Without open water the limit is no brighter than what is far away usually is.
+        // Without open water, the limit is at most the median colour far away, or the largest dark value if
+        // that is larger.
         let far = self.far(c).max(brightest).min(1.0).ln();
         let limit = if self.open.is_some() { 0.0 } else { far };
         let bounds = [
@@ -159,10 +161,10 @@ impl Darkness<'_> {
         found.into_iter().min_by(|a, b| a.cost.total_cmp(&b.cost))
     }
 
-    /// How much faster red and blue fade than green, 1/scene unit, each with its standard error: what the
-    /// usual colour loses of its hue with range once the veil is taken away. A scene may be darker far away,
-    /// as sand near the camera and corals behind it are; that it also has another hue there is less likely.
-    /// `None` where too few classes show light beside the veil.
+    /// How much faster red and blue are attenuated than green, 1/scene unit, each with its standard error. It
+    /// is the change of the median hue with range after the veil is removed. A scene may well be darker far
+    /// away, such as sand near the camera with corals behind it; a different hue there is less likely. `None`
+    /// if too few classes show light above the veil.
     pub(super) fn hues(&self, water: &Water, by_direction: &ByDirection) -> Option<[[f64; 2]; 2]> {
         let direct = |cell: &DarkCell| -> Option<(f64, [f64; 3])> {
             let here = by_direction.along(water, cell.direction.normalize_or(DVec3::Z));
@@ -190,7 +192,7 @@ impl Darkness<'_> {
         (spread > 0.0).then(|| [slope(0), slope(2)])
     }
 
-    /// The darkest of what is near.
+    /// The 20 % quantile of the dark values of the nearest cells.
     fn nearest(&self, c: usize) -> Option<f64> {
         let mut ranges: Vec<f64> = self.dark.iter().map(|cell| cell.range).collect();
         ranges.sort_by(f64::total_cmp);
@@ -201,7 +203,7 @@ impl Darkness<'_> {
         darks.get(darks.len() / 5).copied()
     }
 
-    /// The usual colour of what is farthest.
+    /// The median colour of the farthest cells.
     fn far(&self, c: usize) -> f64 {
         let mut by_range: Vec<(f64, f64)> =
             self.dark.iter().map(|cell| (cell.range, cell.middle[c])).collect();
@@ -211,7 +213,7 @@ impl Darkness<'_> {
         far.get(far.len() / 2).copied().unwrap_or(1.0)
     }
 
-    /// One function of direction of these slopes, bounded by what was seen.
+    /// One function of direction with these slopes, limited to the range of observed directions.
     pub(super) fn by_direction(&self, slopes: [DVec3; 3]) -> ByDirection {
         let dark = self.dark.iter().map(|cell| cell.direction);
         let open = self.open.iter().flat_map(|open| open.seen.iter().map(|(direction, _)| *direction));
@@ -227,15 +229,15 @@ impl Darkness<'_> {
     }
 }
 
-/// Attenuations that agree best with those of the tracks, `[value, standard error]` by channel, and with
-/// `hues`; none is below 0.
+/// The attenuations that best fit both `tracks`, `[value, standard error]` by channel, and `hues`; none is
+/// negative.
 pub(super) fn reconciled(tracks: [[f64; 2]; 3], hues: [[f64; 2]; 2]) -> [[f64; 2]; 3] {
     let weight = |error: f64| if error.is_finite() { error.max(1e-9).powi(-2) } else { 0.0 };
     let own = tracks.map(|[_, error]| weight(error));
     let [red, blue] = hues.map(|[_, error]| weight(error));
     let matrix = [[own[0] + red, -red, 0.0], [-red, own[1] + red + blue, -blue], [0.0, -blue, own[2] + blue]];
     let mut beta: [f64; 3] = tracks.map(|[value, _]| value);
-    // One at a time, so that each can stop at 0.
+    // Coordinate descent, so that each value can stop at 0.
     for _ in 0..200 {
         beta[0] = ((own[0] * tracks[0][0] + red * (beta[1] + hues[0][0])) / matrix[0][0]).max(0.0);
         beta[2] = ((own[2] * tracks[2][0] + blue * (beta[1] + hues[1][0])) / matrix[2][2]).max(0.0);
@@ -254,7 +256,7 @@ fn huber(x: f64) -> f64 {
     if x.abs() <= 1.0 { x } else { x.signum() * (2.0 * x.abs() - 1.0).sqrt() }
 }
 
-/// Spearman's rank correlation of pairs that are sorted by the first.
+/// Spearman's rank correlation of pairs sorted by their first element.
 fn correlation(pairs: &[(f64, f64)]) -> f64 {
     let n = pairs.len() as f64;
     let mut order: Vec<usize> = (0..pairs.len()).collect();
@@ -268,7 +270,7 @@ fn correlation(pairs: &[(f64, f64)]) -> f64 {
 mod tests {
     use super::*;
 
-    /// Darks of a water by range, of which every seventh class holds nothing dark.
+    /// Dark values of a water by range. Every seventh class contains nothing dark.
     fn cells(beta_b: f64, b_inf: f64, slope: f64, black: f64) -> Vec<DarkCell> {
         let of = |k: u32| {
             let range = 4.0 + 26.0 * f64::from(k / 4) / 15.0;
@@ -287,15 +289,15 @@ mod tests {
     }
 
     #[test]
-    fn a_veil_that_grows_is_found_from_its_darks_within_its_errors() {
+    fn growing_veil_is_recovered_from_darks_within_its_errors() {
         let cells = cells(0.09, 0.12, 0.8, 0.002);
         let darkness = darkness(&cells);
         assert!(darkness.grow());
         let found = darkness.veil(1, 0.08).expect("darks");
         let veil = |b_inf: f64, beta_b: f64, range: f64| b_inf * (1.0 - (-beta_b * range).exp());
         for range in [8.0, 15.0, 30.0] {
-            let (truth, told) = (veil(0.12, 0.09, range), veil(found.b_inf[0], found.beta_b[0], range));
-            assert!((told / truth - 1.0).abs() < 0.1, "at {range}: {told} for {truth}");
+            let (truth, fitted) = (veil(0.12, 0.09, range), veil(found.b_inf[0], found.beta_b[0], range));
+            assert!((fitted / truth - 1.0).abs() < 0.1, "at {range}: {fitted} for {truth}");
         }
         assert!((found.b_inf[0] / 0.12).ln().abs() < 2.0 * found.b_inf[1] / found.b_inf[0], "{found:?}");
         assert!((found.beta_b[0] / 0.09).ln().abs() < 2.0 * found.beta_b[1] / found.beta_b[0], "{found:?}");
@@ -303,11 +305,11 @@ mod tests {
     }
 
     #[test]
-    fn the_hue_that_a_scene_loses_with_range_is_that_of_its_attenuation() {
+    fn hue_change_with_range_gives_the_attenuation() {
         let water = Water { beta_d: [0.08, 0.03, 0.02], beta_b: [0.1; 3], b_inf: [0.03, 0.07, 0.12] };
         let mut cells = cells(0.1, 0.1, 0.0, 0.0);
         for (k, cell) in (0_u32..).zip(&mut cells) {
-            // Darker far away, of one hue.
+            // Darker far away, but of constant hue.
             let own = 0.4 * (-0.03 * cell.range).exp() * (1.0 + 0.1 * f64::from(k % 3));
             let light = water.apply(DVec3::new(own, 0.8 * own, 0.7 * own), cell.range);
             cell.middle = light.to_array();
@@ -316,14 +318,14 @@ mod tests {
         let plain = darkness.by_direction([DVec3::ZERO; 3]);
         let [red, blue] = darkness.hues(&water, &plain).expect("light beside the veil");
         assert!((red[0] - 0.05).abs() < 1e-3 && (blue[0] + 0.01).abs() < 1e-3, "{red:?} {blue:?}");
-        // Tracks that see red fade too fast, and green not at all.
+        // Tracks that overestimate the attenuation of red and find none in green.
         let found = reconciled([[0.11, 0.03], [0.0, 0.02], [0.0, f64::INFINITY]], [red, blue]);
         assert!((0.05..0.085).contains(&found[0][0]) && found[1][0] < 0.04, "{found:?}");
         assert!(found[0][1] < 0.03 && found.iter().all(|[beta, error]| *beta >= 0.0 && error.is_finite()));
     }
 
     #[test]
-    fn in_air_the_darks_do_not_grow() {
+    fn dark_values_do_not_grow_in_air() {
         let mut cells = cells(0.0, 0.0, 0.0, 0.0);
         for (k, cell) in (0_u32..).zip(&mut cells) {
             cell.dark = [0.01 + 0.005 * f64::from(k * 7 % 5); 3];
@@ -333,14 +335,14 @@ mod tests {
     }
 
     #[test]
-    fn the_limit_of_a_veil_that_hardly_bends_is_unknown() {
+    fn limit_of_a_nearly_linear_veil_is_unknown() {
         let cells = cells(0.002, 0.8, 0.0, 0.0);
         let found = darkness(&cells).veil(2, 0.0).expect("darks");
         assert!(found.b_inf[1] > 0.25 * found.b_inf[0], "{found:?}");
     }
 
     #[test]
-    fn colours_by_direction_are_bounded_by_what_was_seen() {
+    fn directional_colours_are_limited_to_observed_directions() {
         let cells = cells(0.09, 0.12, 0.8, 0.0);
         let by_direction = darkness(&cells).by_direction([DVec3::NEG_Y * 0.8; 3]);
         assert!(by_direction.is_sound());

@@ -1,13 +1,13 @@
-//! Exposures of the training views on the device: an affine map of colour each, learnt beside the Gaussians.
+//! Exposures of the training views on the device: an affine colour map each, learnt with the Gaussians.
 //!
-//! Photographs of one place differ in exposure and white balance. Without compensation the Gaussians learn
-//! views that are bright from here and dark from there, and veils that make up for the rest. As in 3DGS since
-//! October 2024 (Kerbl et al.), the render of a training view goes through a 3x4 map before the loss;
-//! held-out views and exports take the identity.
+//! Photographs of one place differ in exposure and white balance. Without compensation, the Gaussians learn
+//! colours that are bright from one side and dark from another, and veils for the rest. As in 3DGS since
+//! October 2024 (Kerbl et al.), the render of a training view goes through a 3x4 map before the loss.
+//! Held-out views and exports use the identity.
 //!
-//! The loss does not tell a dark model under bright exposures from the opposite. 3DGS leaves that to chance;
-//! here the mean of all exposures stays the identity, so the model has the mean exposure of its photographs,
-//! which is what the identity stands for on views that were not trained on.
+//! The loss cannot distinguish a dark model with bright exposures from the opposite. 3DGS leaves this to
+//! chance. Here the mean of all exposures stays the identity, so the model has the mean exposure of its
+//! photographs. Views without training thus use the mean exposure.
 
 use crate::Result;
 use crate::appearance::adam::{interpolate_log, unbiasing};
@@ -15,11 +15,11 @@ use crate::appearance::chain::{Appearance, Gradients, Iteration};
 use crate::config::TrainConfig;
 use crate::gpu::{ExposureUniform, Frame, Gpu, Recorder, Size};
 
-/// Pixels that a workgroup of `expose_backward` sums (`shaders/shared/exposure.wgsl`).
+/// Number of pixels that a workgroup of `expose_backward` sums (`shaders/shared/exposure.wgsl`).
 const CHUNK: u32 = 1024;
-/// Decay of the moments: those of the Gaussians' Adam (`shaders/shared/adam.wgsl`).
+/// Decay of the Adam moments, as for the Gaussians (`shaders/shared/adam.wgsl`).
 const BETAS: [f64; 2] = [0.8, 0.99];
-/// Largest factor on the rate of one of many views (`project_backward.wgsl`).
+/// Largest learning-rate scale of a view (`project_backward.wgsl`).
 const MAX_LR_SCALE: f32 = 8.0;
 const IDENTITY: [[f32; 4]; 3] = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]];
 
@@ -28,7 +28,7 @@ const IDENTITY: [[f32; 4]; 3] = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.
 pub struct ExposureStep {
     /// Index of the view.
     pub view: u32,
-    /// Steps that the view will have had after this one, from 1.
+    /// Number of steps of the view including this one, from 1.
     pub steps: u32,
     /// Learning rate of Adam.
     pub rate: f32,
@@ -42,7 +42,7 @@ pub struct Exposures {
     uniform: wgpu::Buffer,
     exposures: wgpu::Buffer,
     moments: wgpu::Buffer,
-    /// Learning rate at the start of the run and at its end, of one view among many.
+    /// Learning rates at the start and at the end of the run, before [`Exposures::lr_scale`].
     rates: [f32; 2],
     sized: Option<Sized>,
 }
@@ -54,7 +54,7 @@ struct Sized {
 }
 
 impl Exposures {
-    /// The identity for each of `views` views.
+    /// Identity exposures for `views` views.
     ///
     /// # Errors
     /// When the device cannot hold them.
@@ -72,7 +72,7 @@ impl Exposures {
         })
     }
 
-    /// The same with the learning rates of a run.
+    /// Sets the learning rates of a run.
     #[must_use]
     pub fn with_rates(self, config: &TrainConfig) -> Self {
         Self { rates: [config.exposure_lr, config.exposure_lr_end], ..self }
@@ -83,24 +83,24 @@ impl Exposures {
         let [start, end] = self.rates;
         ExposureStep {
             view: now.view,
-            // Every view is seen once an epoch; where views have weights, in the mean.
+            // Every view is used once per epoch; with weighted views, on average.
             steps: now.number / now.views + 1,
             rate: Self::lr_scale(now.views as usize) * interpolate_log(start, end, now.progress()),
             size: now.photograph.size,
         }
     }
 
-    /// The factor on the learning rate with `views` views, of which one is seen an iteration: 1 / sqrt(p), p
-    /// the share.
+    /// Learning-rate scale with `views` views, one of which is used per iteration: 1 / sqrt(p), with p the
+    /// share.
     ///
-    /// Where Adam acts on all views in every iteration (3DGS), the second moment of one of them averages the
-    /// zeros of the others too; the same as for Gaussians (`lr_scale` in `project_backward.wgsl`), at most by
-    /// the same factor.
+    /// If Adam updates all views in every iteration (3DGS), the second moment of a view also averages the
+    /// zeros of the other iterations. The scale reproduces this. It is the same as for Gaussians (`lr_scale`
+    /// in `project_backward.wgsl`) and has the same limit.
     pub fn lr_scale(views: usize) -> f32 {
         (views as f32).sqrt().min(MAX_LR_SCALE)
     }
 
-    /// Makes room for pictures of `size`.
+    /// Allocates buffers for pictures of `size`.
     ///
     /// # Errors
     /// When the device cannot hold them.
@@ -123,11 +123,11 @@ impl Exposures {
         })
     }
 
-    /// Records the exposure of the render `image`; gives what the loss is to compare, `[H*W]` vec4: rgb,
+    /// Records the exposure of the render `image`; returns the picture for the loss, `[H*W]` vec4: rgb,
     /// alpha.
     ///
     /// # Errors
-    /// When the kernel does not compile or no room was made.
+    /// When the kernel does not compile or `prepare` was not called.
     pub fn record(
         &self,
         gpu: &Gpu,
@@ -161,12 +161,12 @@ impl Exposures {
         Ok(&sized.exposed)
     }
 
-    /// Records the way back of what [`Exposures::record`] recorded, and the step; nothing is stepped while
-    /// `counters` say that a list was too short. `v_image` holds the gradient by the exposed picture before,
-    /// by `image` after.
+    /// Records the backward pass of [`Exposures::record`], and the step. Nothing is stepped if `counters`
+    /// report an overflowing list. `v_image` holds the gradient of the exposed picture before, and of `image`
+    /// after.
     ///
     /// # Errors
-    /// When a kernel does not compile or no room was made.
+    /// When a kernel does not compile or `prepare` was not called.
     pub fn record_backward(
         &self,
         recorder: &mut Recorder<'_>,
@@ -190,17 +190,17 @@ impl Exposures {
         )
     }
 
-    /// Buffers that must be written before they are read: tests fill them with rubbish first.
+    /// Buffers that are always written before they are read; tests fill them with garbage first.
     ///
     /// # Errors
-    /// When no room was made.
+    /// When `prepare` was not called.
     pub fn scratch(&self) -> Result<[&wgpu::Buffer; 2]> {
         let sized = self.sized()?;
         Ok([&sized.exposed, &sized.partials])
     }
 
-    /// The arrays whose content outlives an iteration, with their bytes: `[views*3]` vec4, rows of A and b,
-    /// and `[views*6]` vec4, their first and second moments.
+    /// The arrays that persist across iterations, with their bytes: `[views*3]` vec4, rows of A and b, and
+    /// `[views*6]` vec4, their first and second moments.
     pub fn arrays(&self) -> [(&wgpu::Buffer, usize); 2] {
         let rows = 3 * self.views as usize;
         [(&self.exposures, 16 * rows), (&self.moments, 32 * rows)]

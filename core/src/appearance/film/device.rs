@@ -1,17 +1,18 @@
-//! View embeddings on the device (FiLM, SMP-UWGS eq. 10): factors on the colours of a training view, between
-//! what is rendered under water and the loss.
+//! View embeddings on the device (FiLM, SMP-UWGS eq. 10): colour factors of a training view, between the
+//! underwater render and the loss.
 //!
-//! Photographs under water differ in light and in what drifts by; Gaussians that have to explain that become
-//! veils. Each training view has an embedding, two numbers for each hidden unit of a small predictor that all
-//! views share: what the unit is scaled and shifted by (`shaders/shared/film.wgsl`). An embedding with a
-//! linear layer to these numbers could say no more. The predictor sees the mean colour of a cell of pixels
-//! and gives factors on its colours; there is no batch norm, so a batch is one view, and factors are above
-//! and below 1, where the released code's sigmoid only darkens.
+//! Underwater photographs differ in light and in drifting particles. Gaussians that have to explain these
+//! differences become veils. Each training view has an embedding: a scale and a shift for each hidden unit of
+//! a small predictor shared by all views (`shaders/shared/film.wgsl`). A linear layer between embedding and
+//! these values would add no expressiveness. The predictor maps the mean colour of a cell of pixels to
+//! factors on its colours. It has no batch norm, because a batch is one view. Factors may be above or below
+//! 1; the sigmoid of the released code only darkens.
 //!
-//! What a unit gives without an embedding is subtracted, so an embedding of 0 is the identity, whatever the
-//! weights. That is what held-out views and exports have, and the mean of all embeddings is kept at 0 as that
-//! of exposures is at the identity: what is common to all views, the brightness of J and the water, stays
-//! with the model up to the second order of the embeddings, which the bound on the factors keeps small.
+//! The output of a unit without an embedding is subtracted, so a zero embedding is the identity for any
+//! weights. Held-out views and exports use the zero embedding. The mean of all embeddings is kept at 0, as
+//! the mean exposure is kept at the identity. What all views have in common, such as the brightness of J and
+//! the water, thus stays in the model, up to second order in the embeddings. The bound on the factors keeps
+//! that order small.
 
 use crate::appearance::adam::{interpolate_log, unbiasing};
 use crate::appearance::chain::{Appearance, Gradients, Iteration, Start};
@@ -23,7 +24,7 @@ use crate::{CoreError, Result};
 
 /// Hidden units of the predictor (`shaders/shared/film.wgsl`).
 pub const FILM_UNITS: usize = 16;
-/// Decay of the moments of the weights, and of those of embeddings (`film_step.wgsl`).
+/// Decay of the Adam moments, of the weights and of the embeddings (`film_step.wgsl`).
 const BETAS: [f64; 2] = [0.9, 0.999];
 const VIEW_BETAS: [f64; 2] = [0.8, 0.99];
 
@@ -37,11 +38,11 @@ pub struct FilmStep {
     pub view: u32,
     /// Width and height of the picture, pixels.
     pub size: [u32; 2],
-    /// Learning rate of Adam; `None` where nothing moves.
+    /// Learning rate of Adam; `None` without a step.
     pub rate: Option<f32>,
-    /// Steps that the weights will have had after this one, from 1.
+    /// Number of weight steps including this one, from 1.
     pub steps: u32,
-    /// Steps that the embedding of the view will have had after this one, from 1.
+    /// Number of steps of the view's embedding including this one, from 1.
     pub view_steps: u32,
 }
 
@@ -66,7 +67,7 @@ struct Sized {
 }
 
 impl Film {
-    /// Embeddings of 0 for `views` views, and weights that follow from `seed`.
+    /// Zero embeddings for `views` views, and weights determined by `seed`.
     ///
     /// # Errors
     /// When the device cannot hold them.
@@ -85,13 +86,13 @@ impl Film {
         Ok(film)
     }
 
-    /// In how many parts the sides of a picture are cut.
+    /// Numbers of cells across and down a picture of `size`.
     pub fn cells(&self, size: [u32; 2]) -> [u32; 2] {
         let cell = self.config.cell.max(1);
         size.map(|side| ((side + cell / 2) / cell).max(1))
     }
 
-    /// The step of an iteration of a run. Steps begin with an epoch, in which each view is seen once.
+    /// The step of an iteration. Steps begin at the start of an epoch, in which each view is used once.
     fn step_at(&self, now: &Iteration<'_>) -> FilmStep {
         let step =
             FilmStep { view: now.view, size: now.photograph.size, rate: None, steps: 0, view_steps: 0 };
@@ -108,7 +109,7 @@ impl Film {
         FilmStep { rate: Some(rate), steps: done + 1, view_steps: done / views + 1, ..step }
     }
 
-    /// Makes room for pictures of `size`.
+    /// Allocates buffers for pictures of `size`.
     ///
     /// # Errors
     /// When the device cannot hold them.
@@ -139,11 +140,11 @@ impl Film {
         })
     }
 
-    /// Records the factors on the picture `image`; gives what the loss is to compare, `[H*W]` vec4: rgb,
+    /// Records the factors on the picture `image`; returns the picture for the loss, `[H*W]` vec4: rgb,
     /// alpha.
     ///
     /// # Errors
-    /// When a kernel does not compile or no room was made.
+    /// When a kernel does not compile or `prepare` was not called.
     pub fn record(
         &self,
         gpu: &Gpu,
@@ -190,12 +191,12 @@ impl Film {
         Ok(&sized.filmed)
     }
 
-    /// Records the way back of what [`Film::record`] recorded, and the step where the schedule has one;
-    /// nothing is stepped while `counters` say that a list was too short. `v_image` holds the gradient by
-    /// what [`Film::record`] gave before, by `image` after.
+    /// Records the backward pass of [`Film::record`], and the step if the schedule has one. Nothing is
+    /// stepped if `counters` report an overflowing list. `v_image` holds the gradient of the output of
+    /// [`Film::record`] before, and of `image` after.
     ///
     /// # Errors
-    /// When a kernel does not compile or no room was made.
+    /// When a kernel does not compile or `prepare` was not called.
     pub fn record_backward(
         &self,
         recorder: &mut Recorder<'_>,
@@ -230,17 +231,17 @@ impl Film {
         )
     }
 
-    /// Buffers that must be written before they are read: tests fill them with rubbish first.
+    /// Buffers that are always written before they are read; tests fill them with garbage first.
     ///
     /// # Errors
-    /// When no room was made.
+    /// When `prepare` was not called.
     pub fn scratch(&self) -> Result<[&wgpu::Buffer; 4]> {
         let sized = self.sized()?;
         Ok([&sized.filmed, &sized.means, &sized.maps, &sized.v_cells])
     }
 
-    /// The arrays whose content outlives an iteration, with their bytes: `[32*3]` vec4, weights and their
-    /// moments; `[views*16]` vec2, embeddings; `[views*32]` vec2, their moments.
+    /// The arrays that persist across iterations, with their bytes: `[32*3]` vec4, weights and their moments;
+    /// `[views*16]` vec2, embeddings; `[views*32]` vec2, their moments.
     pub fn arrays(&self) -> [(&wgpu::Buffer, usize); 3] {
         let numbers = 2 * FILM_UNITS;
         let views = self.views as usize;
@@ -259,7 +260,7 @@ impl Film {
         gpu.read(&self.embeddings, 0, self.views as usize)
     }
 
-    /// The weights: of each unit those of its mean colour and its bias, and those of its factors and 0.
+    /// The weights of each unit: for its mean colour and its bias, then for its factors, and 0.
     ///
     /// # Errors
     /// When the device fails.
@@ -297,7 +298,7 @@ impl Appearance for Film {
     }
 }
 
-/// The embeddings of a run whose water has them.
+/// The embeddings of a run whose water uses them.
 ///
 /// # Errors
 /// When the run has no water, or the device cannot hold them.
@@ -308,8 +309,8 @@ pub(super) fn start(start: &Start<'_>) -> Result<Box<dyn Appearance>> {
     Ok(Box::new(film))
 }
 
-/// Weights of a run's beginning: uniform, as wide as He et al. (2015) have them for units that are 0 on one
-/// side, and biases from 0 to 0.5, so that most units are at work on dark pictures too.
+/// Initial weights: uniform with the width of He et al. (2015) for ReLU units. Biases range from 0 to 0.5, so
+/// that most units are active on dark pictures too.
 fn first_weights(seed: u32) -> Vec<[[f32; 4]; 2]> {
     let wide = |inputs: f32| (6.0 / inputs).sqrt();
     let u = |unit: usize, k: u32| uniform_at(seed, Stream::Film, unit as u32, k);

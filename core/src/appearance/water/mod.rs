@@ -1,10 +1,11 @@
-//! The water of a run on the device: between blending and loss, and the step of its nine numbers.
+//! The water of a run on the device: its effect between blending and loss, and the step of the water
+//! parameters.
 //!
-//! Colours of Gaussians are J in sRGB, so any viewer shows the model right as it is. Where the water acts on
-//! Gaussians, `project_forward` decodes each one, puts it under water and, for blending in sRGB, encodes it
-//! again. Where it acts on pixels, colours are decoded and blended in linear light, or blended as they are,
-//! and `water` puts the picture under water. `water` adds what shows where a ray goes on, the colour of open
-//! water.
+//! Colours of Gaussians are J in sRGB, so any viewer shows the restored model directly. For a water on
+//! Gaussians, `project_forward` decodes each colour, applies the water and encodes it again for blending in
+//! sRGB. For a water on pixels, colours are decoded and blended in linear light, or blended unchanged, and
+//! the kernel `water` applies the water to the picture. `water` also adds the open-water colour where rays
+//! continue.
 
 mod priors;
 mod refinement;
@@ -28,21 +29,21 @@ pub use run::{MediumRun, NetworkRun};
 pub use schedule::WaterSchedule;
 pub(super) use started::StartedWater;
 
-/// Pixels that a workgroup of `water_backward` sums (`shaders/shared/medium.wgsl`).
+/// Number of pixels that a workgroup of `water_backward` sums (`shaders/shared/medium.wgsl`).
 const CHUNK: u32 = 1024;
 /// Decay of Adam's moments (`water_step.wgsl`).
 const BETAS: [f64; 2] = [0.9, 0.999];
-/// Where parts of the state are, bytes.
+/// Byte offsets of parts of the state.
 const SHARES_AT: u64 = offset_of!(WaterState, shares) as u64;
 const MOMENTS_AT: u64 = offset_of!(WaterState, moment1) as u64;
 const GATHERED_AT: u64 = offset_of!(WaterState, gathered) as u64;
 
-/// Gradients that `water_step` gathered.
+/// Gradients collected by `water_step`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Gathered {
-    /// Sums of the gradients by the nine unconstrained numbers.
+    /// Sums of the gradients of the unconstrained parameters.
     pub v_raw: [f32; 9],
-    /// Iterations whose gradients were finite.
+    /// Number of iterations with finite gradients.
     pub iterations: u32,
 }
 
@@ -51,38 +52,37 @@ pub struct Gathered {
 pub struct WaterStep {
     /// Width and height of the picture, pixels.
     pub size: [u32; 2],
-    /// Whether the photograph has pixels that do not count.
+    /// Whether the photograph has masked pixels.
     pub masked: bool,
-    /// Whether alpha is drawn to 1 where the photograph is not open water.
+    /// Whether alpha is pulled to 1 where the photograph does not show open water.
     pub has_surfaces: bool,
-    /// Learning rate of Adam; `None` where the nine numbers stay.
+    /// Learning rate of Adam; `None` if the water parameters are not stepped.
     pub rate: Option<f32>,
-    /// Whether the gradients of the nine numbers are gathered for WaterParamPredict; then they have no rate.
+    /// Whether gradients of the water parameters are collected for WaterParamPredict; then there is no rate.
     pub gathers: bool,
-    /// Steps that the water will have had after this one, from 1.
+    /// Number of steps of the water including this one, from 1.
     pub steps: u32,
-    /// What the weights of eq. 12 to 16 are multiplied by: 0 to 1; not those of `surface_alpha_weight` and
-    /// `overwhite_weight`.
+    /// Factor on the weights of eq. 12 to 16, 0 to 1; not on `surface_alpha_weight` and `overwhite_weight`.
     pub terms: f32,
-    /// How often the picture is halved.
+    /// How many times the picture is halved.
     pub level: u32,
-    /// Columns and rows of the map of what the view's rays end on; 0 where it has none.
+    /// Columns and rows of the view's ray map; 0 without one.
     pub map: [u32; 2],
     /// Distance in sRGB from the colour of open water beyond which a pixel at its edge shows a surface.
     pub alike: f32,
 }
 
-/// The water on the device. Its nine numbers as the stages read them are the frame's.
+/// The water on the device. The frame holds the water parameters that the kernels read.
 pub struct DeviceMedium {
     run: MediumRun,
     uniform: wgpu::Buffer,
     state: wgpu::Buffer,
-    /// Where one of them has a weight.
+    /// Set if a prior has a weight.
     priors: Option<DevicePriors>,
-    /// Where the coefficients follow from range.
+    /// Set if the coefficients depend on range.
     refinement: Option<RefinementStep>,
     sized: Option<Sized>,
-    /// Stands where a view has no map.
+    /// Bound for views without a map.
     no_map: wgpu::Buffer,
 }
 
@@ -95,14 +95,14 @@ struct Sized {
 }
 
 impl DeviceMedium {
-    /// The water at the start of a run; [`DeviceMedium::give_to`] gives it to a frame.
+    /// The water at the start of a run; [`DeviceMedium::give_to`] copies it to a frame.
     ///
     /// # Errors
-    /// When the numbers are none that a water can have, or the device cannot hold them.
+    /// When the parameters are not physical, or the device cannot hold them.
     pub fn new(gpu: &Gpu, run: MediumRun) -> Result<Self> {
         if !(run.water.is_physical() && run.unit > 0.0 && run.unit.is_finite()) {
             return Err(CoreError::Config(format!(
-                "the water to start from must be finite, not below 0 and at most 1 at infinity, and its unit above 0; \
+                "the initial water must be finite, not below 0 and at most 1 at infinity, and its unit above 0; \
                  it is {:?} in units of {}",
                 run.water, run.unit
             )));
@@ -111,8 +111,8 @@ impl DeviceMedium {
             && !(refinement.is_sound() && run.composition.acts_on_pixels())
         {
             return Err(CoreError::Config(format!(
-                "coefficients that follow from range need finite numbers and a water that acts on pixels \
-                 (water.medium = \"per_pixel\"); they are {refinement:?} in a water that acts {:?}",
+                "range-dependent coefficients need finite numbers and a water on pixels \
+                 (water.medium = \"per_pixel\"); they are {refinement:?}, and the water acts on {:?}",
                 run.composition.medium()
             )));
         }
@@ -132,7 +132,7 @@ impl DeviceMedium {
         })
     }
 
-    /// What the run was given.
+    /// The water settings of the run.
     pub fn run(&self) -> &MediumRun {
         &self.run
     }
@@ -142,7 +142,7 @@ impl DeviceMedium {
         medium::of(self.run.composition, Output::Underwater)
     }
 
-    /// Gives the numbers at the start of the run to `frame`.
+    /// Copies the water at the start of the run to `frame`.
     pub fn give_to(&self, gpu: &Gpu, frame: &Frame) {
         let mut water = WaterUniform::from(&self.run.water);
         if let Some(refinement) = &self.run.refinement {
@@ -154,7 +154,7 @@ impl DeviceMedium {
         frame.set_water_uniform(gpu, water);
     }
 
-    /// The nine numbers as they are now.
+    /// The current water parameters.
     ///
     /// # Errors
     /// When the device fails.
@@ -163,7 +163,7 @@ impl DeviceMedium {
         Ok(Water::from_array(std::array::from_fn(|i| f64::from(rows[i / 3][i % 3]))))
     }
 
-    /// How the coefficients follow from range as they do now; `None` where they do not.
+    /// The current range modulation; `None` without one.
     ///
     /// # Errors
     /// When the device fails.
@@ -174,13 +174,13 @@ impl DeviceMedium {
         Ok(Some(start.with_array(std::array::from_fn(|i| f64::from(values[i])))))
     }
 
-    /// What is to be said of the water as it is now.
+    /// The record of the current water.
     ///
     /// # Errors
     /// When the device fails.
     pub fn record_of(&self, gpu: &Gpu, frame: &Frame, metres_per_unit: f64) -> Result<WaterRecord> {
         let run = &self.run;
-        // What the network decided does not move where descent ends before it.
+        // Predicted parameters stay unchanged if descent ends before the network does.
         let ends = run.network.is_some() && run.config.network.until >= run.config.freeze_at;
         let descends = run.is_free && run.config.descends() && !ends;
         let source = if descends { "descended" } else { run.source };
@@ -196,7 +196,7 @@ impl DeviceMedium {
         Ok(state.first().copied().unwrap_or_default())
     }
 
-    /// Steps that were left out since a gradient was not finite.
+    /// Number of steps skipped because of a non-finite gradient.
     ///
     /// # Errors
     /// When the device fails.
@@ -205,7 +205,7 @@ impl DeviceMedium {
         Ok((self.state(gpu)?.left_out as u32).max(refinement))
     }
 
-    /// What stands behind each number after `steps` steps of the water: see
+    /// Evidence for each parameter after `steps` steps of the water: see
     /// [`crate::train::Trainer::water_evidence`].
     pub(crate) fn evidence(&self, gpu: &Gpu, steps: u32) -> Result<[f64; 9]> {
         let state = self.state(gpu)?;
@@ -215,26 +215,25 @@ impl DeviceMedium {
         Ok(std::array::from_fn(|i| if state.raw[i] == start[i] { 0.0 } else { of(i) }))
     }
 
-    /// The gradients that were gathered since this was last asked; the sums start anew. Waits for the device.
+    /// The gradients collected since the last call; resets the sums. Waits for the device.
     ///
     /// # Errors
     /// When the device fails.
     pub fn take_gathered(&self, gpu: &Gpu) -> Result<Gathered> {
         let state = self.state(gpu)?;
-        // The sums, and the number of iterations behind them.
+        // The sums and their number of iterations.
         gpu.write(&self.state, GATHERED_AT, &[0.0_f32; 10]);
         Ok(Gathered { v_raw: state.gathered, iterations: state.gathered_iterations as u32 })
     }
 
-    /// Puts the water of nine unconstrained numbers, finite and in the order of eq. 8, in the place of that
-    /// of now.
+    /// Sets the water from finite unconstrained parameters in the order of eq. 8.
     pub fn set_raw(&self, gpu: &Gpu, frame: &Frame, raw: [f32; 9]) {
         gpu.write(&self.state, 0, &raw);
         frame.set_nine(gpu, &Water::from_raw(raw.map(f64::from), self.run.unit));
     }
 
-    /// Has descent begin anew at the nine unconstrained numbers `raw`, whose standard errors, of the numbers
-    /// themselves, are from now on those that are told.
+    /// Restarts descent at the unconstrained parameters `raw`. `standard_error` holds the standard errors of
+    /// the water parameters from now on.
     pub fn begin_at(&mut self, gpu: &Gpu, frame: &Frame, raw: [f32; 9], standard_error: [f64; 9]) {
         self.set_raw(gpu, frame, raw);
         gpu.write(&self.state, MOMENTS_AT, &[[0.0_f32; 9]; 2]);
@@ -243,19 +242,19 @@ impl DeviceMedium {
         self.set_standard_error(standard_error);
     }
 
-    /// Tells these standard errors of the nine numbers from now on.
+    /// Sets the standard errors of the water parameters.
     pub fn set_standard_error(&mut self, standard_error: [f64; 9]) {
         self.run.standard_error = Some(standard_error);
     }
 
-    /// What outlives an iteration, with its bytes: Adam's state, and the numbers of `frame` that the device
-    /// made of it.
+    /// The buffers that persist across iterations, with their bytes: Adam's state, and the water in `frame`
+    /// that the device derives from it.
     pub fn arrays<'a>(&'a self, frame: &'a Frame) -> Vec<(&'a wgpu::Buffer, usize)> {
         let own = [(&self.state, size_of::<WaterState>()), (&frame.water, size_of::<WaterUniform>())];
         own.into_iter().chain(self.refinement.as_ref().map(RefinementStep::array)).collect()
     }
 
-    /// Makes room for pictures of `size` and for Gaussians up to `gaussians` in `blocks` blocks.
+    /// Allocates buffers for pictures of `size` and for up to `gaussians` Gaussians in `blocks` blocks.
     ///
     /// # Errors
     /// When the device cannot hold them.
@@ -280,12 +279,12 @@ impl DeviceMedium {
         Ok(())
     }
 
-    /// `Medium` of an iteration, for the stages of a water on Gaussians.
+    /// The `Medium` uniform of an iteration, for the kernels of a water on Gaussians.
     pub(super) fn uniform(&self) -> &wgpu::Buffer {
         &self.uniform
     }
 
-    /// Sums by workgroup of the gradient by the water parameters, for the same.
+    /// Sums by workgroup of the gradient of the water parameters, for the same kernels.
     pub(super) fn partials(&self) -> Result<&wgpu::Buffer> {
         Ok(&self.sized()?.partials)
     }
@@ -296,21 +295,21 @@ impl DeviceMedium {
             .ok_or_else(|| CoreError::Gpu("a water was recorded before its buffers were made".into()))
     }
 
-    /// Whether the picture under water is formed in sRGB.
+    /// Whether the underwater picture is formed in sRGB.
     fn is_formed_in_srgb(&self) -> bool {
         self.run.composition == Composition::GaussiansSrgb
     }
 
-    /// Whether the picture under water is formed in sRGB and has to be decoded for the loss.
+    /// Whether the underwater picture is formed in sRGB and must be decoded for the loss.
     fn is_decoded(&self) -> bool {
         self.run.config.loss_light == LossLight::Linear && self.is_formed_in_srgb()
     }
 
-    /// Records the picture under water; gives what the loss is to compare, `[H*W]` vec4: colour in the light
-    /// of the loss, alpha.
+    /// Records the underwater picture; returns the picture for the loss, `[H*W]` vec4: colour in the light of
+    /// the loss, alpha.
     ///
     /// # Errors
-    /// When the kernel does not compile or no room was made.
+    /// When the kernel does not compile or `prepare` was not called.
     pub fn record(
         &self,
         gpu: &Gpu,
@@ -352,7 +351,7 @@ impl DeviceMedium {
         };
         gpu.write(&self.uniform, 0, &[uniform]);
         if let Some(refinement) = &self.refinement {
-            // They rest while the nine do, and while WaterParamPredict decides these.
+            // Not stepped while the water parameters are fixed or predicted.
             let rate = step.rate.map_or(0.0, |_| config.dbdr.lr);
             refinement.set(gpu, gaussian_rows, rate, step.steps);
         }
@@ -376,13 +375,13 @@ impl DeviceMedium {
         Ok(&sized.seen)
     }
 
-    /// Records the way back of what [`DeviceMedium::record`] recorded, and the priors. `v_image` holds the
-    /// gradient by the picture before, by what was blended and its alpha after; `truth` is the photograph
-    /// that it was compared with, `map` what its rays end on, where that is known; `step` is that of
-    /// `record`.
+    /// Records the backward pass of [`DeviceMedium::record`], and the priors.
+    ///
+    /// `v_image` holds the gradient of the picture before, and of the blended colour and its alpha after.
+    /// `truth` is the photograph, and `map` its ray map, if known. `step` is that of `record`.
     ///
     /// # Errors
-    /// When a kernel does not compile or no room was made.
+    /// When a kernel does not compile or `prepare` was not called.
     pub fn record_backward(
         &self,
         gpu: &Gpu,
@@ -433,9 +432,9 @@ impl DeviceMedium {
         self.priors.as_ref().map_or(Ok(()), |priors| priors.record_after(recorder, maps, &step))
     }
 
-    /// Records the step of the nine numbers, and of the factors by range, after the Gaussians have moved:
-    /// theirs is the gradient at the water that was rendered. Nothing is stepped while the frame says that a
-    /// list was too short.
+    /// Records the step of the water parameters and of the range modulation, after the step of the Gaussians,
+    /// whose gradients belong to the rendered water. Nothing is stepped if the frame reports an overflowing
+    /// list.
     ///
     /// # Errors
     /// When the kernel does not compile or no room was made.
@@ -458,10 +457,10 @@ impl DeviceMedium {
         }
     }
 
-    /// Buffers that must be written before they are read: tests fill them with rubbish first.
+    /// Buffers that are always written before they are read; tests fill them with garbage first.
     ///
     /// # Errors
-    /// When no room was made.
+    /// When `prepare` was not called.
     pub fn scratch(&self) -> Result<Vec<&wgpu::Buffer>> {
         let sized = self.sized()?;
         let priors = self.priors.iter().flat_map(DevicePriors::scratch);

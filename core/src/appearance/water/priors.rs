@@ -1,28 +1,27 @@
-//! The priors of a run under water on the device (SMP-UWGS eq. 12 to 14): the dark channel of the direct
-//! signal, and depth that is smooth but at edges of the photograph.
+//! Priors of an underwater run on the device (SMP-UWGS eq. 12 to 14): the dark channel of the direct signal,
+//! and smooth depth except at edges of the photograph.
 //!
-//! They have no forward pass of their own: the loss of a picture is not asked for, only where it goes. The
-//! gradient of the dark channel by the picture is added before the way back through the water, whatever that
-//! water is; what goes to alpha, range and the nine numbers past the picture is added after it. Minima are
-//! found along rows, then columns, with the first of equal pixels, and each pixel gathers its gradient in a
-//! fixed order: the same bytes in every run.
+//! They have no forward pass, since only their gradients are needed. The dark channel adds its gradient of
+//! the picture before the backward pass of the water, whatever the water is. Direct gradients of alpha, range
+//! and the water parameters are added after it. Minima are found along rows, then columns, with the first of
+//! equal pixels. Each pixel collects its gradient in a fixed order, so every run gives the same bytes.
 
 use super::WaterStep;
 use crate::config::{DarkChannelOn, LossLight, PriorsConfig, WaterConfig};
 use crate::gpu::{Frame, Gpu, PriorsUniform, Recorder, Size};
 use crate::{CoreError, Result};
 
-/// Pixels that a workgroup of `dark_channel_backscatter` sums: as `water_backward`
+/// Number of pixels that a workgroup of `dark_channel_backscatter` sums, as in `water_backward`
 /// (`shaders/shared/medium.wgsl`).
 const CHUNK: u32 = 1024;
-/// Windows that a thread makes (`shaders/shared/slide.wgsl`).
+/// Number of windows per thread (`shaders/shared/slide.wgsl`).
 const WINDOWS: u32 = 8;
 
 /// The priors of a run on the device.
 pub struct DevicePriors {
     config: PriorsConfig,
     light: LossLight,
-    /// Usual viewing distance, scene units.
+    /// Scene scale, scene units.
     unit: f32,
     uniform: wgpu::Buffer,
     dark_channel: Option<DarkChannel>,
@@ -36,29 +35,28 @@ struct DarkChannel {
     columns: wgpu::Buffer,
 }
 
-/// What the priors look at in an iteration, and what they add to.
+/// The inputs of the priors in an iteration, and the gradients that they add to.
 #[derive(Clone, Copy)]
 pub struct PriorMaps<'a> {
-    /// What was blended, its range, and the nine numbers.
+    /// The blended picture, its range image, and the water parameters.
     pub frame: &'a Frame,
     /// The picture under water in the light of the loss, `[H*W]` vec4: colour, alpha.
     pub seen: &'a wgpu::Buffer,
     /// The photograph, `[H*W]` packed.
     pub truth: &'a wgpu::Buffer,
-    /// Gradient by the picture under water before the way back through the water; by what was blended and its
-    /// alpha after it, `[H*W]` vec4.
+    /// `[H*W]` vec4: before the backward pass of the water, the gradient of the underwater picture; after it,
+    /// of the blended picture and its alpha.
     pub v_image: &'a wgpu::Buffer,
-    /// Gradient by the blended range, `[H*W]`.
+    /// Gradient of the blended range, `[H*W]`.
     pub v_range: &'a wgpu::Buffer,
-    /// Sums by workgroup of the gradient by the nine numbers; rows of pixels come first.
+    /// Sums by workgroup of the gradient of the water parameters; rows of pixels come first.
     pub partials: &'a wgpu::Buffer,
-    /// The same by the four numbers of eq. 9.
+    /// The same for the four parameters of eq. 9.
     pub refinement_partials: &'a wgpu::Buffer,
 }
 
 impl DevicePriors {
-    /// The priors of a water, `unit` scene units the usual viewing distance; `None` where all have the
-    /// weight 0.
+    /// The priors of a water, with the scene scale `unit` in scene units; `None` if all weights are 0.
     pub fn new(gpu: &Gpu, config: &WaterConfig, unit: f64) -> Option<Self> {
         let priors = &config.priors;
         (priors.dark_channel > 0.0 || priors.depth_smoothness > 0.0).then(|| Self {
@@ -70,7 +68,7 @@ impl DevicePriors {
         })
     }
 
-    /// Makes room for pictures of `size`.
+    /// Allocates buffers for pictures of `size`.
     ///
     /// # Errors
     /// When the device cannot hold them.
@@ -96,15 +94,15 @@ impl DevicePriors {
             .ok_or_else(|| CoreError::Gpu("a dark channel was recorded before its buffers were made".into()))
     }
 
-    /// Whether they do anything in an iteration.
+    /// Whether the priors have any effect in an iteration.
     fn is_on(step: &WaterStep) -> bool {
         step.terms > 0.0
     }
 
-    /// Records what goes to the picture under water, between the loss and the way back through the water.
+    /// Records the gradient of the underwater picture, between the loss and the backward pass of the water.
     ///
     /// # Errors
-    /// When a kernel does not compile or no room was made.
+    /// When a kernel does not compile or `prepare` was not called.
     pub fn record(
         &self,
         gpu: &Gpu,
@@ -158,11 +156,11 @@ impl DevicePriors {
         )
     }
 
-    /// Records what goes to alpha, range and the nine numbers past the picture, after the way back through
-    /// the water.
+    /// Records the direct gradients of alpha, range and the water parameters, after the backward pass of the
+    /// water.
     ///
     /// # Errors
-    /// When a kernel does not compile or no room was made.
+    /// When a kernel does not compile or `prepare` was not called.
     pub fn record_after(
         &self,
         recorder: &mut Recorder<'_>,
@@ -198,7 +196,7 @@ impl DevicePriors {
         Ok(())
     }
 
-    /// Buffers that must be written before they are read: tests fill them with rubbish first.
+    /// Buffers that are always written before they are read; tests fill them with garbage first.
     pub fn scratch(&self) -> impl Iterator<Item = &wgpu::Buffer> {
         self.dark_channel.iter().flat_map(|buffers| [&buffers.signal, &buffers.rows, &buffers.columns])
     }

@@ -1,7 +1,7 @@
-//! The factors by range of a water that acts on pixels (DBDR, SMP-UWGS eq. 9): their step on the device.
+//! The Adam step of the range modulation of a water on pixels (DBDR, SMP-UWGS eq. 9), on the device.
 //!
-//! The four numbers lie beside the nine in the uniform of the water, so that whatever forms a picture has
-//! them; here is Adam's state, which outlives an iteration with them.
+//! Its four parameters are stored with the water parameters in the water uniform, where all kernels that form
+//! a picture find them. This file holds Adam's state, which persists across iterations.
 
 use super::BETAS;
 use crate::Result;
@@ -9,14 +9,14 @@ use crate::appearance::adam::unbiasing;
 use crate::gpu::{DbdrState, DbdrUniform, Frame, Gpu, Recorder, Size};
 use crate::water::RangeModulation;
 
-/// Adam on the four numbers of a [`RangeModulation`].
+/// Adam on the four parameters of a [`RangeModulation`].
 pub(super) struct RefinementStep {
     uniform: wgpu::Buffer,
     state: wgpu::Buffer,
 }
 
 impl RefinementStep {
-    /// At `refinement`, with no step behind it.
+    /// The state at `refinement`, before any step.
     ///
     /// # Errors
     /// When the device cannot hold it.
@@ -27,14 +27,14 @@ impl RefinementStep {
         Ok(Self { uniform: gpu.uniform("dbdr", &DbdrUniform::default()), state })
     }
 
-    /// Says how the next step is done: over `rows` rows of sums, as step number `steps`, from 1.
+    /// Sets the next step: over `rows` rows of sums, as step number `steps`, from 1.
     pub fn set(&self, gpu: &Gpu, rows: u32, rate: f32, steps: u32) {
         let [unbias1, unbias2] = unbiasing(BETAS, steps).map(|value| value as f32);
         gpu.write(&self.uniform, 0, &[DbdrUniform { rows, rate, unbias1, unbias2 }]);
     }
 
-    /// Records the step on the sums in `partials`; none is taken while the frame says that a list was too
-    /// short.
+    /// Records the step on the sums in `partials`; nothing is stepped if the frame reports an overflowing
+    /// list.
     ///
     /// # Errors
     /// When the kernel does not compile.
@@ -52,12 +52,12 @@ impl RefinementStep {
         )
     }
 
-    /// The state with its bytes: it outlives an iteration.
+    /// The state with its bytes; it persists across iterations.
     pub fn array(&self) -> (&wgpu::Buffer, usize) {
         (&self.state, size_of::<DbdrState>())
     }
 
-    /// Steps that were left out since a gradient was not finite.
+    /// Number of steps skipped because of a non-finite gradient.
     ///
     /// # Errors
     /// When the device fails.

@@ -1,69 +1,65 @@
-//! The water that a run has, and what follows from it before a step is taken: how fast each number moves, how
-//! wide Gaussians may be, and which terms say nothing in water that is no veil.
+//! The water of a run and the settings that depend on it: parameter rates, the maximum width of Gaussians,
+//! and the loss terms that are off in clear water.
 
 use crate::config::{Composition, DbdrMode, WaterConfig};
 use crate::water::{ByDirection, RangeModulation, Water, WaterRecord};
 
-/// Standard error of a number, as a share of it, from which it moves at the full rate; a surer one in
-/// proportion to its variance, as weak evidence moves what is known.
+/// Relative standard error from which a parameter is optimised at the full rate. A smaller error reduces the
+/// rate in proportion to the variance, since weak evidence should barely move a known value.
 const UNSURE: f64 = 0.25;
-/// Deviation that any Gaussian may have, in [`Water::half_distance`]: its edges, two deviations off, are
-/// hardly hidden. Against half the viewing distance alone, held-out views of reef-clip went from 26.83 to
-/// 26.98 dB and those of fox, which has no water, from 31.24 to 31.60 dB.
+/// Standard deviation allowed for any Gaussian, in units of [`Water::half_distance`]: its edges, two
+/// deviations off, are hardly hidden. Compared with a limit of half the scene scale, held-out views improved
+/// from 26.83 to 26.98 dB on reef-clip. On fox, which has no water, they improved from 31.24 to 31.60 dB.
 const WIDEST_IN_HALVES: f64 = 0.15;
-/// Share of the light of the clearest channel that a water takes at the usual viewing distance before it
-/// counts as a veil: 0.44 for sesa-wreck and 0.001 for reef-clip, where the term that closes surfaces cost
-/// 0.3 dB.
+/// Minimum share of the clearest channel's light that the water takes at the scene scale to count as a veil.
+/// It is 0.44 for sesa-wreck and 0.001 for reef-clip, where the term that closes surfaces cost 0.3 dB.
 const LEAST_VEIL: f64 = 0.05;
 
-/// The same from which sparse points know better than photographs where a surface is: 0.43 for sesa-wreck.
+/// The same share from which sparse points locate surfaces better than photographs: 0.43 for sesa-wreck.
 const THICK_VEIL: f64 = 0.25;
 
-/// The water that a run has.
+/// The water of a run.
 #[derive(Clone, Debug, PartialEq)]
 pub struct MediumRun {
-    /// How it is stepped. Its keys `medium` and `blend` are what the user wrote: `composition` is what holds.
+    /// Its settings. The keys `medium` and `blend` are those of the user; `composition` is what applies.
     pub config: WaterConfig,
     /// Where it acts, and how Gaussians are blended.
     pub composition: Composition,
-    /// The nine numbers at the start.
+    /// The water parameters at the start.
     pub water: Water,
-    /// How the coefficients follow from range at the start, where they do: only where the water acts on
-    /// pixels.
+    /// Range modulation at the start, if there is any; only for a water on pixels.
     pub refinement: Option<RangeModulation>,
-    /// How the colour of open water changes with direction, where it does: only where the water acts on
-    /// pixels.
+    /// Change of the open-water colour with direction, if there is any; only for a water on pixels.
     pub by_direction: Option<ByDirection>,
-    /// Channels whose numbers stay as they are: descent has nothing to say where the darkest pixels had to.
+    /// Channels whose parameters are fixed: for those from the darkest pixels, descent has no information.
     pub stays: [bool; 3],
-    /// Whether photographs show open water, and views have maps of where ([`crate::water::OpenWater`]);
-    /// `None` where nobody looked.
+    /// Whether photographs show open water, with ray maps of the views ([`crate::water::OpenWater`]); `None`
+    /// if they were not searched.
     pub shows_open_water: Option<bool>,
-    /// Scene units by which the unconstrained numbers are multiplied: the usual viewing distance.
+    /// Factor on the unconstrained parameters: the scene scale, scene units.
     pub unit: f64,
-    /// Whether the numbers move in their part of the run; else they stay as they are.
+    /// Whether the parameters are optimised in their part of the run.
     pub is_free: bool,
-    /// Of the nine numbers at the start, in the order of eq. 8, where something says how sure they are.
-    /// Descent has none of its own, so they stay those of the start, or are those of what WaterParamPredict
-    /// said of the views.
+    /// Standard errors of the water parameters at the start, in the order of eq. 8, if known. Descent does
+    /// not change them; WaterParamPredict replaces them by those of its predictions.
     pub standard_error: Option<[f64; 9]>,
-    /// Where they come from: as [`WaterRecord::source`].
+    /// Source of the parameters, as in [`WaterRecord::source`].
     pub source: &'static str,
-    /// There where WaterParamPredict decides them in the first part of the run, near `water`; not where they
-    /// are not free.
+    /// Set if WaterParamPredict predicts the parameters in the first part of the run, near `water`. `None`
+    /// for a fixed water.
     pub network: Option<NetworkRun>,
 }
 
 /// A run that begins with WaterParamPredict.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct NetworkRun {
-    /// The nine numbers by the sparse points with their standard errors, in the order of eq. 8, where they
-    /// tell something: what the network found is compared with them.
+    /// The water parameters of the sparse estimate and their standard errors, in the order of eq. 8, if
+    /// available. The predictions are compared with them.
     pub sparse: Option<([f64; 9], [f64; 9])>,
 }
 
 impl MediumRun {
-    /// A water that starts from the numbers of the configuration; `unit` is the usual viewing distance.
+    /// A water that starts from the configured parameters; `unit` is the scene scale.
     pub fn fixed(config: &WaterConfig, composition: Composition, unit: f64) -> Self {
         let in_scene_units = |beta: [f64; 3]| beta.map(|value| value / unit);
         let water = Water {
@@ -89,7 +85,7 @@ impl MediumRun {
         }
     }
 
-    /// What share of the rate each number has: its relative variance as a share of that of [`UNSURE`]; at
+    /// Share of the learning rate for each parameter: its relative variance divided by that of [`UNSURE`], at
     /// most 1.
     pub(super) fn shares_of_rate(&self, water: &Water, standard_error: Option<[f64; 9]>) -> [f32; 9] {
         let Some(errors) = standard_error else { return [1.0; 9] };
@@ -108,8 +104,8 @@ impl MediumRun {
 
     /// Largest standard deviation that a Gaussian may have, scene units.
     ///
-    /// The clearer the water the wider: what stands behind a scene and is seen has a colour of its own, and a
-    /// water that hides nothing needs no limit.
+    /// The clearer the water, the larger the limit: whatever is visible behind the scene has its own colour,
+    /// and water without a veil needs no limit.
     pub fn largest_deviation(&self) -> f32 {
         match self.config.largest_deviation {
             0.0 => f32::INFINITY,
@@ -117,21 +113,19 @@ impl MediumRun {
         }
     }
 
-    /// Whether the water is so clear that it is no veil before anything at the usual viewing distance. A
-    /// model over black stays one, whatever its numbers become: what takes open water for what is behind
-    /// would contradict it.
+    /// Whether the water is too clear to be a veil at the scene scale. A model blended over black stays clear
+    /// whatever its parameters become: terms that treat the background as open water would contradict it.
     fn is_clear(&self) -> bool {
         let no_veil = self.veil() < LEAST_VEIL;
         self.composition == Composition::PixelsOverBlack || (no_veil && self.shows_open_water != Some(true))
     }
 
-    /// Share of the light of the clearest channel that the water takes at the usual viewing distance.
+    /// Share of the clearest channel's light that the water takes at the scene scale.
     fn veil(&self) -> f64 {
         1.0 - 0.5_f64.powf(self.unit / self.water.half_distance())
     }
 
-    /// The same, blended over black in clear water where the configuration lets it
-    /// (`water.clear_over_black`).
+    /// Blends over black if the water is clear and the configuration allows it (`water.clear_over_black`).
     #[must_use]
     pub(crate) fn over_what_is_behind(mut self) -> Self {
         let may_be = self.config.clear_over_black && !self.config.has_dark_channel();
@@ -141,55 +135,56 @@ impl MediumRun {
         self
     }
 
-    /// `weight`, but nothing in clear water.
+    /// `weight`, but 0 in clear water.
     fn where_veiled(&self, weight: f32) -> f32 {
         if self.is_clear() { 0.0 } else { weight }
     }
 
-    /// How near to the colour of open water a pixel must be to count as that. Where photographs were searched
-    /// for open water and show none, every ray ends on a surface, whatever its colour: the dark bluish floor
-    /// of a sparse survey was else taken for open water, and nothing held it.
+    /// Maximum distance of a pixel from the colour of open water to count as such. If photographs were
+    /// searched and show no open water, it is 0: every ray ends on a surface. Otherwise the dark bluish floor
+    /// of a sparse survey was taken for open water, and nothing held it in place.
     pub(super) fn background_distance(&self) -> f32 {
         if self.shows_open_water == Some(false) { 0.0 } else { self.config.alpha_background_distance }
     }
 
-    /// What `alpha_background` weighs. In clear water a ray that meets nothing ends on Gaussians behind the
-    /// scene, and nobody knows the colour of open water: without the term held-out views of reef-clip went
-    /// from 26.92 to 27.09 dB.
+    /// The effective weight of `alpha_background`. In clear water it is 0: a ray without a hit ends on
+    /// Gaussians behind the scene, and the open-water colour is unknown. Without the term, held-out views of
+    /// reef-clip improved from 26.92 to 27.09 dB.
     pub(super) fn background_weight(&self) -> f32 {
         self.where_veiled(self.config.alpha_background)
     }
 
-    /// What `surface_alpha_weight` weighs. In clear water open water has no other colour to be told from, and
-    /// the term only stands in the way.
+    /// The effective weight of `surface_alpha_weight`. In clear water it is 0: the colour of open water is no
+    /// different there, so the term only does harm.
     pub(super) fn surface_weight(&self) -> f32 {
         self.where_veiled(self.config.surface_alpha_weight)
     }
 
-    /// What ranges that are far from those of the sparse points weigh. In clear water the picture itself
-    /// holds surfaces where they are.
+    /// The effective weight of ranges that differ from those of the sparse points. In clear water it is 0,
+    /// since the picture itself locates surfaces.
     pub(super) fn range_weight(&self) -> f32 {
         self.where_veiled(self.config.sparse_ranges)
     }
 
-    /// By how much the logarithm of a range may be off that of the sparse points. Through a veil the points
-    /// know better than the photographs where a surface is; else the photographs do, and cells are coarse,
-    /// with surfaces that run through them aslant. At 3 % held-out views of seathru-japan and seathru-curasao
-    /// lost 0.2 dB; at a fifth those of a sparse survey lost 0.7 dB.
+    /// Tolerance of the logarithm of a range relative to the sparse points. Through a veil, points locate
+    /// surfaces better than photographs. Otherwise photographs do, since cells are coarse and surfaces cross
+    /// them at an angle. At 3 %, held-out views of seathru-japan and seathru-curasao lost 0.2 dB; at a fifth,
+    /// those of a sparse survey lost 0.7 dB.
     pub fn range_slack(&self) -> f32 {
         if self.veil() < THICK_VEIL { 0.2 } else { 0.03 }
     }
 
-    /// Optical depth that the Gaussians around a sparse point must have. In clear water the picture itself
-    /// holds surfaces.
+    /// Minimum optical depth of the Gaussians around a sparse point. In clear water it is 0, since the
+    /// picture itself locates surfaces.
     pub(crate) fn least_cover(&self) -> f32 {
         self.where_veiled(self.config.least_cover)
     }
 
-    /// What colours above white weigh. In clear water the photograph holds J itself, which is above white in
-    /// a channel of which little arrives: the term took 2 % of the contrast of red on reef-clip, of which a
-    /// seventh arrives. Nor where photographs show open water: that is kept empty by what they show, and
-    /// bright sand under a lamp or the sun may be above white.
+    /// The effective weight of colours above white. In clear water it is 0: the photograph shows J itself,
+    /// which exceeds white in a channel with little light. On reef-clip, where a seventh of the red light
+    /// arrives, the term cost 2 % of the contrast of red. It is also 0 if photographs show open water. The
+    /// water is then kept empty by these observations, and bright sand under a lamp or in sunlight may exceed
+    /// white.
     pub(crate) fn saturation_weight(&self) -> f32 {
         if self.shows_open_water == Some(true) {
             0.0
@@ -198,16 +193,15 @@ impl MediumRun {
         }
     }
 
-    /// By what the rate of the higher bands is multiplied. In clear water there is sunlight, which moves over
-    /// the scene from one photograph to the next. Colours by direction take it up as well as veils before the
-    /// cameras do, at rates that suffice, and leave the constant colour its mean. In murky water they would
-    /// only take up noise. A scene that is looked at from one side has light of that kind too: on
-    /// seathru-japan 0.2 dB and 0.0024 of SSIM.
+    /// Learning-rate scale of the higher SH bands. In clear water, sunlight moves over the scene between
+    /// photographs. With a high enough rate, the higher bands absorb it instead of veils in front of the
+    /// cameras, and the constant colour keeps its mean. In murky water they would only fit noise. A scene
+    /// viewed from one side has such light too: on seathru-japan the gain was 0.2 dB and 0.0024 of SSIM.
     pub(crate) fn harmonics_lr_scale(&self) -> f32 {
         if self.is_clear() || self.shows_open_water == Some(true) { self.config.clear_harmonics } else { 1.0 }
     }
 
-    /// The water of a model that was trained before, which stays as it is.
+    /// The fixed water of a model that was trained before.
     pub fn of_record(record: &WaterRecord, config: &WaterConfig, unit: f64) -> Self {
         Self {
             config: config.clone(),
@@ -225,13 +219,12 @@ impl MediumRun {
         }
     }
 
-    /// The same, but it moves from there, each number in proportion to its variance.
+    /// The same water, optimised further, each parameter in proportion to its variance.
     pub fn going_on(record: &WaterRecord, config: &WaterConfig, unit: f64) -> Self {
         Self { is_free: true, ..Self::of_record(record, config, unit) }
     }
 
-    /// The same with every term of the loss that the water adds multiplied by `factor`
-    /// (`partition.weights = loss_factor`).
+    /// Multiplies all loss terms of the water by `factor` (`partition.weights = loss_factor`).
     #[must_use]
     pub(crate) fn times(mut self, factor: f32) -> Self {
         let WaterConfig {
@@ -267,7 +260,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn clear_water_is_blended_over_black_where_it_may_be() {
+    fn clear_water_is_blended_over_black_if_allowed() {
         use Composition::{GaussiansSrgb, PixelsLinear, PixelsOverBlack, PixelsSrgb};
         let of = |beta: f64, config: WaterConfig, composition: Composition| {
             let water = Water { beta_d: [9.0, beta, 0.1 * beta], ..Water::COASTAL };
@@ -292,21 +285,21 @@ mod tests {
     }
 
     #[test]
-    fn gaussians_may_be_wide_in_clear_water_and_in_murky_water_half_of_a_viewing_distance() {
+    fn gaussians_may_be_wider_in_clear_water() {
         let widest = |clearest: f64, share: f32| {
             let config = WaterConfig { largest_deviation: share, ..WaterConfig::default() };
             let water = Water { beta_d: [0.9, clearest, 2.0 * clearest], ..Water::COASTAL };
             MediumRun { water, ..MediumRun::fixed(&config, Composition::PixelsSrgb, 3.0) }.largest_deviation()
         };
         assert_eq!(widest(0.5, 0.5), 1.5);
-        // Half of the light of the clearest channel is gone after ln 2 / 0.01 = 69 units.
+        // The clearest channel loses half of its light after ln 2 / 0.01 = 69 units.
         assert!((widest(0.01, 0.5) - 0.15 * 69.3).abs() < 0.01);
         assert_eq!(widest(0.0, 0.5), f32::INFINITY);
         assert_eq!(widest(0.5, 0.0), f32::INFINITY);
     }
 
     #[test]
-    fn terms_that_tell_scene_from_water_weigh_nothing_where_the_water_is_no_veil() {
+    fn terms_against_veils_are_off_in_clear_water() {
         let of = |clearest: f64, unit: f64| {
             let water = Water { beta_d: [0.9, clearest, 2.0 * clearest], ..Water::COASTAL };
             let run = MediumRun {
@@ -325,7 +318,7 @@ mod tests {
     }
 
     #[test]
-    fn sparse_points_hold_ranges_closely_behind_a_veil_alone_and_clear_water_needs_no_cover() {
+    fn range_slack_and_cover_depend_on_the_veil() {
         let of = |clearest: f64| {
             let water = Water { beta_d: [0.9, clearest, 2.0 * clearest], ..Water::COASTAL };
             let run = MediumRun {
@@ -339,7 +332,7 @@ mod tests {
     }
 
     #[test]
-    fn a_model_over_black_keeps_what_clear_water_has_when_its_water_turns_out_not_to_be_clear() {
+    fn model_over_black_counts_as_clear_whatever_its_water() {
         let (config, over_black) = (WaterConfig::default(), Composition::PixelsOverBlack);
         let water = Water { beta_d: [0.9, 0.01, 0.02], ..Water::COASTAL };
         let run = MediumRun { water, ..MediumRun::fixed(&config, over_black, 7.0) };
@@ -349,7 +342,7 @@ mod tests {
     }
 
     #[test]
-    fn clear_water_alone_raises_the_rate_of_harmonics() {
+    fn only_clear_water_raises_the_rate_of_harmonics() {
         let of = |clearest: f64| {
             let water = Water { beta_d: [0.9, clearest, 2.0 * clearest], ..Water::COASTAL };
             let config = WaterConfig { clear_harmonics: 3.0, ..WaterConfig::default() };
@@ -360,13 +353,13 @@ mod tests {
     }
 
     #[test]
-    fn a_number_moves_in_proportion_to_its_relative_variance_and_freely_where_it_is_unknown() {
+    fn rate_share_is_proportional_to_the_relative_variance() {
         let unit = 10.0;
         let run = MediumRun::fixed(&WaterConfig::default(), Composition::PixelsSrgb, unit);
         let water = Water { beta_d: [0.4, 0.04, 0.0], beta_b: [0.4, 0.04, 0.04], b_inf: [0.1, 0.1, 0.1] };
         let errors = [0.04, 0.004, 0.001, f64::INFINITY, 0.01, 0.02, 0.0, 0.0125, f64::NAN];
         let shares = run.shares_of_rate(&water, Some(errors));
-        // A tenth is four tenths of a quarter, in murky water as in clear.
+        // A relative error of a tenth is four tenths of a quarter, in murky water and in clear.
         for (share, expected) in shares.iter().zip([0.16, 0.16, 1.0, 1.0, 1.0, 1.0, 0.0, 0.25, 1.0]) {
             assert!((share - expected).abs() < 1e-6, "{shares:?}");
         }

@@ -1,16 +1,16 @@
-//! When a water moves, and how fast.
+//! When the water parameters are optimised, and at which rate.
 
 use super::MediumRun;
 use crate::appearance::adam::interpolate_log;
 use crate::config::{DbdrMode, WaterConfig};
 
-/// The schedule of a water in a run of some length.
+/// The schedule of a water in a run.
 #[derive(Clone, Debug)]
 pub struct WaterSchedule {
     iterations: u32,
-    /// First iteration whose water WaterParamPredict does not decide; 0 where it decides none.
+    /// First iteration whose water does not come from WaterParamPredict; 0 without predictions.
     network_end: u32,
-    /// Where the water is free to move.
+    /// The configuration, if the water is optimised.
     free: Option<WaterConfig>,
 }
 
@@ -24,7 +24,7 @@ impl WaterSchedule {
         }
     }
 
-    /// First iteration whose water WaterParamPredict does not decide; 0 where it decides none.
+    /// First iteration whose water does not come from WaterParamPredict; 0 without predictions.
     pub fn network_end(&self) -> u32 {
         self.network_end
     }
@@ -33,8 +33,8 @@ impl WaterSchedule {
         iteration as f32 / self.iterations as f32
     }
 
-    /// Learning rate of the water at an iteration, and how many steps it has had after that one; `None` where
-    /// it stays.
+    /// Learning rate of the water at an iteration, and its number of steps including this one; `None` without
+    /// a step.
     pub fn step(&self, iteration: u32) -> Option<(f32, u32)> {
         let water = self.free.as_ref().filter(|water| water.dbdr.mode != DbdrMode::None)?;
         let progress = self.progress(iteration);
@@ -48,15 +48,15 @@ impl WaterSchedule {
         Some((interpolate_log(water.lr, water.lr_end, share.clamp(0.0, 1.0)), iteration - first + 1))
     }
 
-    /// Whether colours have no higher bands at this share of the run (`water.sh0_while_free`).
-    pub fn has_plain_colours(&self, progress: f32) -> bool {
+    /// Whether colours are limited to SH degree 0 at this share of the run (`water.sh0_while_free`).
+    pub fn has_sh0_only(&self, progress: f32) -> bool {
         let decided = self.network_end as f32 / self.iterations as f32;
         let moves = |water: &WaterConfig| progress < if water.descends() { water.freeze_at } else { decided };
         self.free.as_ref().is_some_and(|water| water.sh0_while_free && moves(water))
     }
 }
 
-/// [`WaterSchedule::network_end`]: at least one iteration where there is a network.
+/// [`WaterSchedule::network_end`]: at least one iteration with a network.
 fn network_end(medium: &MediumRun, iterations: u32) -> u32 {
     if !medium.is_free || medium.network.is_none() {
         return 0;
@@ -72,7 +72,7 @@ mod tests {
     use crate::config::Composition;
 
     #[test]
-    fn descent_begins_where_the_network_ends() {
+    fn descent_begins_when_the_network_ends() {
         let water =
             WaterConfig { start_at: 0.125, freeze_at: 0.5, lr: 1e-2, lr_end: 1e-3, ..WaterConfig::default() };
         let run = |network: Option<NetworkRun>, is_free: bool| {

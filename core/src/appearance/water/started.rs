@@ -1,4 +1,4 @@
-//! A water in a run: what a water on pixels and one on Gaussians have in common as appearances.
+//! The water of a run: the common part of the appearances for water on pixels and on Gaussians.
 
 use super::{DeviceMedium, WaterSchedule, WaterStep};
 use crate::appearance::chain::{Gradients, Iteration, Start};
@@ -10,7 +10,7 @@ use crate::{CoreError, Result};
 pub(in crate::appearance) struct StartedWater {
     pub(in crate::appearance) medium: DeviceMedium,
     schedule: WaterSchedule,
-    /// Most Gaussians that are trained, and in how many blocks.
+    /// Maximum number of trained Gaussians, and number of their blocks.
     gaussians: u32,
     blocks: u32,
 }
@@ -19,7 +19,7 @@ impl StartedWater {
     /// The water of the run at its start.
     ///
     /// # Errors
-    /// When the run has none, its numbers are none that a water can have, or the device cannot hold it.
+    /// When the run has none, its parameters are not physical, or the device cannot hold it.
     pub(in crate::appearance) fn new(start: &Start<'_>) -> Result<Self> {
         let run = start.medium.ok_or_else(|| CoreError::Config("the run has no water".to_owned()))?;
         Ok(Self {
@@ -46,7 +46,7 @@ impl StartedWater {
             rate: step.map(|(rate, _)| rate),
             gathers: self.gathers(now),
             steps: step.map_or(0, |(_, steps)| steps),
-            // A water that stays is past the stages in which they begin.
+            // A fixed water is past the stages in which the terms begin.
             terms: if run.is_free { run.config.priors.share(progress) } else { 1.0 },
             level: now.level,
             map: map.map_or([0; 2], |map| map.size),
@@ -54,13 +54,13 @@ impl StartedWater {
         }
     }
 
-    /// Whether gradients are gathered for WaterParamPredict.
+    /// Whether gradients are collected for WaterParamPredict.
     fn gathers(&self, now: &Iteration<'_>) -> bool {
         now.number < self.schedule.network_end()
     }
 
-    /// Whether the numbers move, or their gradients are gathered, with the step of the Gaussians. Where the
-    /// network made the water of this view, it took the gradients before.
+    /// Whether the water parameters are stepped, or their gradients collected, with the step of the
+    /// Gaussians. If the network predicted the water from this view, it already took the gradients.
     pub(in crate::appearance) fn steps_with_gaussians(&self, now: &Iteration<'_>) -> bool {
         self.schedule.step(now.number).is_some() || (self.gathers(now) && !now.is_predicted)
     }

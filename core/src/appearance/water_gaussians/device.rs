@@ -1,5 +1,5 @@
-//! The water in the colours of the Gaussians: `project_forward` puts each one under water before it is
-//! blended. What follows the blending is the open water that shows where a ray goes on.
+//! Water in the colours of the Gaussians: `project_forward` applies it to each one before blending. After
+//! blending, the open-water colour is added where rays continue.
 
 use crate::Result;
 use crate::appearance::chain::{Appearance, Gradients, Iteration, SplatGradients};
@@ -17,10 +17,10 @@ impl WaterOnGaussians {
 }
 
 impl DeviceMedium {
-    /// Records what goes from the gradients of all splats to the water parameters, before the Gaussians move.
+    /// Records the gradients from all splats to the water parameters, before the step of the Gaussians.
     ///
     /// # Errors
-    /// When a kernel does not compile or no room was made.
+    /// When a kernel does not compile or `prepare` was not called.
     pub fn record_gradients(
         &self,
         gpu: &Gpu,
@@ -58,7 +58,7 @@ impl Appearance for WaterOnGaussians {
         self.0.prepare(gpu, size)
     }
 
-    /// The blended picture is that of the frame, whose ranges the water needs too.
+    /// Uses the blended picture of the frame, since the water also needs its ranges.
     fn record<'a>(
         &'a self,
         recorder: &mut Recorder<'_>,

@@ -1,4 +1,4 @@
-//! The water between blending and loss: the blended picture is put under water, pixel by pixel.
+//! Water between blending and loss, applied to the blended picture pixel by pixel.
 
 use crate::Result;
 use crate::appearance::chain::{Appearance, Gradients, Iteration};
@@ -20,7 +20,7 @@ impl Appearance for WaterOnPixels {
         self.0.prepare(gpu, size)
     }
 
-    /// The blended picture is that of the frame, whose ranges the water needs too.
+    /// Uses the blended picture of the frame, since the water also needs its ranges.
     fn record<'a>(
         &'a self,
         recorder: &mut Recorder<'_>,

@@ -1,4 +1,4 @@
-//! Layers against plain loops and central differences.
+//! Tests of layers against plain loops and central differences.
 
 use super::random;
 use crate::nets::attention::{AttentionGate, SeResidual, SqueezeExcite};
@@ -36,7 +36,7 @@ fn picture(values: &[f64], [channels, height, width]: [usize; 3]) -> Image<f64> 
 fn assert_same(what: &str, found: &[f64], expected: &[f64]) {
     assert_eq!(found.len(), expected.len(), "{what}");
     for (at, (a, b)) in found.iter().zip(expected).enumerate() {
-        // Both are f64; sums of some hundred terms of size 1.
+        // Both are f64; sums of a few hundred terms of size 1.
         assert!((a - b).abs() < 1e-12 * (1.0 + b.abs()), "{what}, element {at}: {a} {b}");
     }
 }
@@ -46,7 +46,7 @@ fn sigmoid(x: f64) -> f64 {
 }
 
 #[test]
-fn group_norm_is_that_of_plain_loops() {
+fn group_norm_matches_plain_loops() {
     let size @ [channels, height, width] = [8, 4, 5];
     let mut layout = Layout::default();
     let norm = GroupNorm::new(&mut layout, channels);
@@ -68,7 +68,7 @@ fn group_norm_is_that_of_plain_loops() {
 }
 
 #[test]
-fn squeeze_and_excitation_is_that_of_plain_loops() {
+fn squeeze_and_excitation_matches_plain_loops() {
     let size @ [channels, height, width] = [8, 4, 6];
     let mut layout = Layout::default();
     let block = SqueezeExcite::new(&mut layout, channels);
@@ -96,7 +96,7 @@ fn squeeze_and_excitation_is_that_of_plain_loops() {
 }
 
 #[test]
-fn the_attention_gate_is_that_of_plain_loops() {
+fn attention_gate_matches_plain_loops() {
     let size @ [channels, height, width] = [8, 4, 6];
     let mut layout = Layout::default();
     let gate = AttentionGate::new(&mut layout, channels);
@@ -130,8 +130,8 @@ fn the_attention_gate_is_that_of_plain_loops() {
 }
 
 #[test]
-fn a_convolution_is_that_of_plain_loops_and_so_is_its_mean() {
-    // Odd sizes and counts too, so that no block of the inner loops is filled.
+fn convolution_and_its_mean_match_plain_loops() {
+    // Including odd sizes and counts, so that blocks of the inner loops are not full.
     for (size @ [from, height, width], to) in
         [([16, 8, 12], 8), ([1, 8, 12], 8), ([3, 5, 7], 5), ([2, 2, 2], 1), ([4, 23, 19], 6)]
     {
@@ -164,7 +164,7 @@ fn a_convolution_is_that_of_plain_loops_and_so_is_its_mean() {
 }
 
 #[test]
-fn the_transposed_convolution_is_that_of_plain_loops() {
+fn transposed_convolution_matches_plain_loops() {
     let (size @ [from, height, width], to) = ([6, 4, 5], 3);
     let mut layout = Layout::default();
     let up = UpConv::new(&mut layout, from, to);
@@ -185,7 +185,7 @@ fn the_transposed_convolution_is_that_of_plain_loops() {
     assert_same("up", &up.forward(&fixture.weights, &picture(&x, size)).values, &expected);
 }
 
-/// Compares what `backward(weights, x, v_y, v_weights)` gives with central differences of
+/// Compares the result of `backward(weights, x, v_y, v_weights)` with central differences of
 /// `forward(weights, x)`, at all weights and inputs.
 #[track_caller]
 fn check_gradients(
@@ -199,7 +199,7 @@ fn check_gradients(
     let loss = |weights: &[f64], x: &[f64]| -> f64 {
         forward(weights, x).iter().zip(&v_y).map(|(y, v)| y * v).sum()
     };
-    // Gradients are added to what is there.
+    // Gradients are added to existing values.
     let mut v_weights = vec![1.0; weights.len()];
     let v_x = backward(weights, x, &v_y, &mut v_weights);
     v_weights.iter_mut().for_each(|v| *v -= 1.0);
@@ -346,7 +346,7 @@ fn gradients_of_the_other_layers_match_central_differences() {
 }
 
 #[test]
-fn what_is_not_a_number_comes_through_every_layer() {
+fn nan_propagates_through_every_layer() {
     let mut values = [-1.0, f64::NAN, 2.0, f64::NEG_INFINITY];
     relu(&mut values);
     assert!(values[0] == 0.0 && values[1].is_nan() && values[2..] == [2.0, 0.0], "{values:?}");

@@ -1,38 +1,38 @@
-//! A photograph by cells: their mean colour, and whether anything is to be seen in them.
+//! Divides a photograph into cells: their mean colour, and whether they show any structure.
 
 use crate::views::PackedImage;
 
-/// Cells along the longer side of a photograph: small enough for the gaps of a reef, large enough to tell a
-/// smooth colour from noise.
+/// Number of cells along the longer side of a photograph: small enough for the gaps of a reef, large enough
+/// to distinguish a smooth colour from noise.
 const CELLS: f64 = 56.0;
-/// No cell is smaller, pixels.
+/// Minimum side of a cell, pixels.
 const LEAST_SIDE: f64 = 6.0;
 
-/// A photograph by cells, row-major from the top left. Cell (i, j) holds the pixels that
-/// [`crate::views::RayMap`] says.
+/// The cells of a photograph, row-major from the top left. Cell (i, j) holds the pixels defined by
+/// [`crate::views::RayMap`].
 #[derive(Clone, Debug, Default)]
 pub(super) struct Cells {
     pub(super) columns: u32,
     pub(super) rows: u32,
     /// Mean colour, 8-bit sRGB codes.
     pub(super) means: Vec<[f32; 3]>,
-    /// What is left of pairs of pixels once a plane is taken away: standard deviation of the channel that has
-    /// most, codes. Infinite where a pixel does not count, or is saturated.
+    /// Residual of 2 x 2 pixel means after subtracting a plane: the largest standard deviation of a channel,
+    /// codes. Infinite if a pixel is masked or saturated.
     pub(super) texture: Vec<f32>,
-    /// How far pixels are from the mean, root mean square over three channels, codes.
+    /// Root mean square distance of pixels from the mean over three channels, codes.
     pub(super) spread: Vec<f32>,
-    /// By how much the mean differs from the line between its neighbours, of the channel and the direction
-    /// that differ most, codes.
+    /// Difference of the mean from the line between opposite neighbours: the largest over channels and
+    /// directions, codes.
     pub(super) bend: Vec<f32>,
 }
 
-/// Cells across and down of a picture.
+/// Numbers of cells across and down a picture.
 pub(super) fn grid(width: u32, height: u32) -> [u32; 2] {
     let side = (f64::from(width.max(height)) / CELLS).max(LEAST_SIDE);
     [width, height].map(|pixels| (f64::from(pixels) / side).round().max(1.0) as u32)
 }
 
-/// Pixels of cell `index` of `cells` along a side of `pixels`.
+/// The pixels of cell `index` of `cells` along a side of `pixels` pixels.
 pub(super) fn span(index: u32, cells: u32, pixels: u32) -> std::ops::Range<u32> {
     // The smallest x with x * cells / pixels >= index.
     let from = |index: u32| (u64::from(index) * u64::from(pixels)).div_ceil(u64::from(cells)) as u32;
@@ -92,7 +92,7 @@ fn look(image: &PackedImage, x: std::ops::Range<u32>, y: std::ops::Range<u32>) -
     if !counts || across < 2 || down < 2 {
         return (means, f32::INFINITY, spread);
     }
-    // Means of two by two pixels, so that single pixels of noise count little.
+    // Means of 2 x 2 pixels reduce the noise of single pixels.
     let middle = |count: u32| f64::from(count - 1) / 2.0;
     let n = f64::from(across * down);
     let mut most = 0.0_f64;
@@ -115,7 +115,7 @@ fn look(image: &PackedImage, x: std::ops::Range<u32>, y: std::ops::Range<u32>) -
                 yy += dy * dy;
             }
         }
-        // The grid is even, so the three parts of the plane do not share anything.
+        // The grid is regular, so the three components of the plane are orthogonal.
         let left = squares - sum * sum / n - by_x * by_x / xx - by_y * by_y / yy;
         most = most.max(left.max(0.0) / n);
     }
@@ -135,7 +135,7 @@ mod tests {
     }
 
     #[test]
-    fn every_pixel_lies_in_the_one_cell_that_the_map_of_a_view_has_for_it() {
+    fn every_pixel_lies_in_the_cell_of_its_ray_map() {
         for (width, height) in [(444, 296), (97, 31), (56, 200), (5, 3)] {
             let [columns, rows] = grid(width, height);
             for (cells, pixels) in [(columns, width), (rows, height)] {
@@ -149,7 +149,7 @@ mod tests {
     }
 
     #[test]
-    fn a_smooth_slope_has_no_texture_and_an_edge_has() {
+    fn smooth_slope_has_no_texture_but_an_edge_has() {
         let slope = Cells::of(&picture(336, 336, |x, y| [(x / 2) as u8, (y / 2) as u8, 90]));
         assert!(slope.texture.iter().all(|texture| *texture < 0.3), "{:?}", slope.texture);
         let edge = Cells::of(&picture(336, 336, |x, _| if x % 4 < 2 { [60, 80, 90] } else { [70, 80, 90] }));
@@ -157,7 +157,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_wider_than_a_cell_is_seen_between_cells() {
+    fn structure_wider_than_a_cell_shows_as_bend() {
         let band =
             Cells::of(&picture(224, 224, |_, y| if (100..108).contains(&y) { [40; 3] } else { [60; 3] }));
         let most = band.bend.iter().copied().fold(0.0, f32::max);
@@ -166,7 +166,7 @@ mod tests {
     }
 
     #[test]
-    fn a_cell_with_a_masked_or_a_saturated_pixel_shows_nothing_for_certain() {
+    fn masked_or_saturated_pixels_make_a_cell_uncertain() {
         let mut masked = picture(112, 112, |_, _| [9; 3]);
         masked.pixels[0] &= 0x00ff_ffff;
         assert_eq!(Cells::of(&masked).texture[0], f32::INFINITY);

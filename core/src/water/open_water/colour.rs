@@ -1,25 +1,25 @@
-//! The colour of open water by direction, from cells that may show it.
+//! Fits the colour of open water by direction to cells that may show it.
 
 use glam::DVec3;
 
 use super::super::dense;
 use crate::picture::{linear_to_srgb, srgb_to_linear};
 
-/// Rounds of weights.
+/// Rounds of reweighting.
 const ROUNDS: usize = 20;
-/// Least scale of what counts as near the fit, 8-bit codes over three channels.
+/// Minimum scale of the robust weights, 8-bit codes over three channels.
 const LEAST_SCALE: f64 = 3.0;
-/// Farthest from the fit that a cell may be, the same.
+/// Maximum distance of a cell from the fit, 8-bit codes over three channels.
 pub(super) const FARTHEST: f64 = 20.0;
-/// Weight of slopes of 0, as a share of the cells: it decides only where all look into one direction.
+/// Ridge weight on the slopes, as a share of the cells. It only matters if all cells look in one direction.
 const RIDGE: f64 = 1e-4;
-/// What 8 bits and a photograph's processing leave of a colour, codes.
+/// Accuracy of a colour after quantisation to 8 bits and image processing, codes.
 const ROUNDING: f64 = 0.5;
 
 /// A cell that may show open water.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Candidate {
-    /// Which view it is of.
+    /// Index of its view.
     pub(super) view: u32,
     /// Unit direction, scene axes.
     pub(super) direction: DVec3,
@@ -27,14 +27,14 @@ pub(super) struct Candidate {
     pub(super) codes: [f32; 3],
 }
 
-/// The colour of open water as a function of direction that is smooth over all views.
+/// The colour of open water as a smooth function of direction, common to all views.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Fitted {
     /// Mean direction of the cells, not of unit length.
     pub(super) middle: DVec3,
-    /// Natural logarithm of the colour there, linear light.
+    /// Natural logarithm of the colour in the middle direction, linear light.
     pub(super) at_middle: [f64; 3],
-    /// Change by direction, scene axes.
+    /// Change of the logarithm by direction, scene axes.
     pub(super) slopes: [DVec3; 3],
     /// Standard error of `at_middle`.
     pub(super) error: [f64; 3],
@@ -46,12 +46,12 @@ impl Fitted {
         std::array::from_fn(|c| (self.at_middle[c] + self.slopes[c].dot(direction - self.middle)).exp())
     }
 
-    /// How far `codes` are from the colour along `direction`, 8-bit codes over three channels.
+    /// Distance of `codes` from the colour along `direction`, 8-bit codes over three channels.
     pub(super) fn distance(&self, direction: DVec3, codes: [f32; 3]) -> f64 {
         distance(self.along(direction), codes)
     }
 
-    /// The robust fit of a plane to the logarithms; `None` where there is nothing to fit.
+    /// A robust fit of a plane to the logarithms; `None` without cells.
     pub(super) fn of(cells: &[Candidate]) -> Option<Self> {
         if cells.is_empty() {
             return None;
@@ -86,7 +86,7 @@ impl Fitted {
         Some(fitted)
     }
 
-    /// Views are what is independent: a cell's neighbours are wrong with it. Rounding comes on top.
+    /// Views are the independent units, since neighbouring cells share errors. Rounding is added.
     fn errors(&self, cells: &[Candidate], logs: &[[f64; 3]], weights: &[f64]) -> [f64; 3] {
         let mut views: Vec<(u32, f64, [f64; 3])> = Vec::new();
         for ((cell, logs), weight) in cells.iter().zip(logs).zip(weights) {
@@ -116,7 +116,7 @@ pub(super) fn distance(linear: [f64; 3], codes: [f32; 3]) -> f64 {
     (off(0).powi(2) + off(1).powi(2) + off(2).powi(2)).sqrt()
 }
 
-/// The middle of `values`, which are finite or infinite; 0 of none.
+/// The median of `values`, which may be infinite; 0 if empty.
 pub(super) fn median(mut values: Vec<f64>) -> f64 {
     let at = values.len() / 2;
     if values.is_empty() { 0.0 } else { *values.select_nth_unstable_by(at, f64::total_cmp).1 }
@@ -127,7 +127,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_colour_that_grows_upwards_is_found_among_cells_that_show_something_else() {
+    fn colour_growing_upwards_is_fitted_despite_other_cells() {
         let (slopes, at) = ([-0.4, -1.3, -2.5], [0.02, 0.06, 0.12]);
         let mut cells = Vec::new();
         for view in 0..12_u32 {

@@ -1,4 +1,4 @@
-//! A dive over a floor that ends, in memory: for tests of what photographs tell of the water.
+//! An in-memory dive over a floor that ends, for tests of water estimates from photographs.
 
 use std::sync::Arc;
 
@@ -13,7 +13,7 @@ use crate::water::{ByDirection, Water};
 
 pub(in crate::water) const WATER: Water =
     Water { beta_d: [0.16, 0.06, 0.04], beta_b: [0.14, 0.07, 0.05], b_inf: [0.03, 0.07, 0.13] };
-/// The floor ends here, scene units ahead.
+/// End of the floor, scene units ahead.
 const END: f64 = 24.0;
 
 pub(in crate::water) fn brighter_upwards() -> ByDirection {
@@ -24,18 +24,18 @@ pub(in crate::water) fn brighter_upwards() -> ByDirection {
     }
 }
 
-/// Views over a floor of dark and bright stones, 2 below them, that look along it or down on it; y down.
+/// Views over a floor of dark and bright stones, 2 below them, looking along it or down on it; y down.
 pub(in crate::water) struct Dive {
     pub(in crate::water) points: Points,
     pub(in crate::water) photographs: InMemory,
-    /// By view and pixel whether a ray meets the floor.
+    /// By view and pixel, whether the ray hits the floor.
     pub(in crate::water) floor: Vec<Vec<bool>>,
 }
 
 fn colour_of(position: DVec3) -> [f64; 3] {
     let cell = |x: f64| ((2.0 * x).floor() as i64 + 500) as u32;
     let tone = f64::from(uniform_at(5, Stream::Test, cell(position.x), cell(position.z)));
-    // A tenth of the stones is black.
+    // A tenth of the stones are black.
     let tone = if tone < 0.1 { 0.0 } else { tone };
     [0.6 * tone, 0.5 * tone, 0.4 * tone]
 }

@@ -1,23 +1,24 @@
-//! Which rays leave the scene: those that pass above everything that was reconstructed.
+//! Finds the rays that leave the scene: those that pass above everything that was reconstructed.
 
 use glam::DVec3;
 
 use crate::scene::Points;
 use crate::views::TrainView;
 
-/// Points that the outline is made of, evenly thinned.
+/// Maximum number of points for the outline, evenly thinned.
 const MOST_POINTS: usize = 32_768;
 /// Sectors of azimuth around a camera.
 const SECTORS: usize = 180;
-/// A sector counts as far up as the highest of so many to either side.
+/// A sector has the highest elevation among itself and this many neighbours on either side.
 const BESIDE: usize = 2;
-/// Share of a sector's points that may be astray.
+/// Share of a sector's points that may be outliers.
 const ASTRAY: f64 = 0.01;
-/// How much higher than the outline a ray must go, radians: a degree.
+/// Minimum elevation of a ray above the outline, radians: one degree.
 const ABOVE: f64 = 0.0175;
-/// Rays further down than this end somewhere: sine of the elevation, of ten degrees.
+/// Lowest elevation of a ray that may leave the scene, as a sine: ten degrees down. Steeper rays end on a
+/// surface.
 const LOWEST: f64 = -0.17;
-/// Cameras whose mean image axis is shorter agree on no direction as up.
+/// Minimum length of the mean up axis of the cameras; below it, they agree on no direction.
 const AGREE: f64 = 0.5;
 
 /// The levelled frame of a scene: unit vectors in scene axes.
@@ -29,8 +30,7 @@ pub(super) struct Levelled {
 }
 
 impl Levelled {
-    /// By the mean of what the cameras hold for up; `None` where they do not agree, as in a survey straight
-    /// down.
+    /// From the mean up axis of the cameras; `None` if they do not agree, as in a survey straight down.
     pub(super) fn of(views: &[TrainView]) -> Option<Self> {
         let mean = |axis: DVec3| {
             let sum: DVec3 = views.iter().map(|view| view.pose.rotation.inverse() * axis).sum();
@@ -48,7 +48,7 @@ impl Levelled {
     }
 }
 
-/// What was reconstructed, as a camera sees its upper outline.
+/// The reconstructed points, for the upper outline that a camera sees.
 pub(super) struct Hull {
     levelled: Levelled,
     positions: Vec<DVec3>,
@@ -62,7 +62,7 @@ impl Hull {
         Self { levelled, positions }
     }
 
-    /// The upper outline around `eye`: elevation by sector of azimuth, radians; -infinity where nothing is.
+    /// The upper outline around `eye`: elevation by sector of azimuth, radians; -infinity in empty sectors.
     pub(super) fn outline(&self, eye: DVec3) -> Outline {
         let mut sectors = vec![Vec::new(); SECTORS];
         for position in &self.positions {
@@ -93,7 +93,7 @@ impl Hull {
         !self.is_steep(direction) && elevation > outline.0[self.sector(direction)] + ABOVE
     }
 
-    /// Whether a ray along `direction`, unit length, goes so far down that it ends somewhere.
+    /// Whether a ray along `direction`, unit length, points down so steeply that it must end on a surface.
     pub(super) fn is_steep(&self, direction: DVec3) -> bool {
         direction.dot(self.levelled.up) <= LOWEST
     }
@@ -105,7 +105,7 @@ impl Hull {
     }
 }
 
-/// Elevation of the highest that was reconstructed, by sector.
+/// Highest elevation of the reconstructed points, by sector.
 pub(super) struct Outline(Vec<f64>);
 
 #[cfg(test)]
@@ -137,7 +137,7 @@ mod tests {
     }
 
     #[test]
-    fn rays_above_the_reef_leave_it_and_rays_into_it_or_steeply_down_do_not() {
+    fn only_rays_above_the_reef_leave_the_scene() {
         let views = [view(DVec3::ZERO, DVec3::Z)];
         let levelled = Levelled::of(&views).expect("a camera that looks ahead");
         assert!(
@@ -147,12 +147,12 @@ mod tests {
         let outline = hull.outline(DVec3::ZERO);
         let leaves = |y: f64, z: f64| hull.is_left_by(&outline, DVec3::new(0.0, y, z).normalize());
         assert!(leaves(-0.2, 1.0) && !leaves(-0.09, 1.0) && !leaves(0.05, 1.0));
-        assert!(leaves(-0.05, -1.0), "behind the camera nothing is");
-        assert!(!leaves(0.5, -1.0), "but what looks down may meet a floor that nobody saw");
+        assert!(leaves(-0.05, -1.0), "nothing is behind the camera");
+        assert!(!leaves(0.5, -1.0), "a ray pointing down may hit a floor that no view shows");
     }
 
     #[test]
-    fn cameras_that_look_straight_down_in_all_turns_agree_on_no_up() {
+    fn cameras_looking_down_at_all_headings_have_no_common_up() {
         let looking = |at: DVec3| view(DVec3::ZERO, at);
         let down: Vec<TrainView> = [[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]]
             .map(|[x, z]| looking(DVec3::new(1e-3 * x, 1.0, 1e-3 * z)))

@@ -1,11 +1,11 @@
-//! What the rays of a view end on, by its cells.
+//! Maps what the rays of a view end on, by cells.
 //!
-//! Certain are cells that pass above everything that was reconstructed, show nothing and have the colour of
-//! open water. From them open water goes on, from cell to cell, as far as nothing is seen and the colour
-//! stays: around a mast, down to the edge of a reef. It ends where there is texture, another colour, or a
-//! sighted point in the cell or beside it. In the cells where it ends, pixels are told apart by their own
-//! colour ([`EndsOn::Edge`]). What looks like open water but is not connected with it may be a gap in a reef
-//! or a smooth stone, so nothing is said of it.
+//! Certain cells pass above everything that was reconstructed, have no structure and have the colour of open
+//! water. From them, open water spreads from cell to cell while there is no structure and the colour stays:
+//! around a mast, down to the edge of a reef. It ends at texture, at another colour, or at a sighted point in
+//! the cell or a neighbour. In the cells where it ends, each pixel is decided by its own colour
+//! ([`EndsOn::Edge`]). A region that looks like open water but is not connected with it may be a gap in a
+//! reef or a smooth stone. It stays unknown.
 
 use glam::DVec3;
 use rayon::prelude::*;
@@ -13,24 +13,23 @@ use rayon::prelude::*;
 use super::{OfView, colour};
 use crate::views::{EndsOn, RayMap};
 
-/// How near to the colour of open water a cell must be that shows nothing else for certain, 8-bit codes: what
-/// is farther off is shown by Gaussians if at all. At 20 the pixels of seathru-japan of which nobody is
-/// certain had 32.8 dB, at 12 33.4.
+/// Maximum distance of a certain cell from the colour of open water, 8-bit codes. Anything farther off is
+/// left to the Gaussians. At 20, the uncertain pixels of seathru-japan had 32.8 dB; at 12, 33.4 dB.
 const CERTAIN: f64 = 12.0;
-/// How near to the colour of open water a smooth cell must be to look like it, and a pixel at the edge of it:
-/// so many times what certain cells, and pixels in them, usually are off by.
+/// Maximum distance of a similar cell, or of a pixel at an edge, from the colour of open water. It is a
+/// multiple of the median distance of certain cells, or of the pixels in them.
 const TIMES: f64 = 2.0;
-/// Between these, 8-bit codes.
+/// Limits of that distance, 8-bit codes.
 const LEAST_ALIKE: f64 = 2.0;
 const MOST_ALIKE: f64 = 10.0;
-/// A cell above the scene that is farther off is no open water, whatever it is; 8-bit codes.
+/// A cell above the scene at this distance or farther is not open water; 8-bit codes.
 const OTHER: f64 = 24.0;
-/// Rings of cells around open water whose pixels are told apart. With one ring 5 % of the open water of a
-/// forward look lies in cells that count as surfaces, with two 1 %.
+/// Rings of cells around open water whose pixels are decided one by one. In a forward view, one ring leaves 5
+/// % of the open water in cells that count as surfaces; two rings leave 1 %.
 const EDGES: u32 = 2;
 
-/// The maps of `views` where open water has the colour `along` a direction, linear light; `noise` as
-/// [`super::noise`] has it.
+/// The maps of `views`, with the colour of open water `along` a direction, linear light, and `noise` from
+/// [`super::noise`].
 pub(super) fn ray_maps(
     views: Vec<OfView>,
     noise: f64,
@@ -61,8 +60,8 @@ fn is_certain(view: &OfView, off: &[f64], cell: usize, noise: f64) -> bool {
     off[cell] < CERTAIN && view.may_be_open(cell, noise)
 }
 
-/// The map of a view whose cells are `off` from the colour of open water; cells and pixels look like it that
-/// are less than `alike` off.
+/// The map of a view whose cells are `off` from the colour of open water. Cells below `alike`, and pixels
+/// below `of_pixels`, look like open water.
 fn ray_map(view: OfView, off: &[f64], noise: f64, [alike, of_pixels]: [f64; 2]) -> RayMap {
     let mut ends: Vec<EndsOn> = (0..off.len())
         .map(|cell| match view.near[cell] {
@@ -98,7 +97,7 @@ fn ray_map(view: OfView, off: &[f64], noise: f64, [alike, of_pixels]: [f64; 2]) 
     RayMap { columns: view.columns, rows: view.rows, cells: ends, ranges: view.ranges, alike }
 }
 
-/// The cells beside `cell`, those at its corners too where `corners` is 1.
+/// The neighbours of `cell`, including the diagonal ones if `corners` is 1.
 fn around(view: &OfView, cell: usize, corners: i64) -> impl Iterator<Item = usize> {
     let (columns, rows) = (i64::from(view.columns), i64::from(view.rows));
     let (row, column) = (cell as i64 / columns, cell as i64 % columns);
@@ -117,11 +116,11 @@ mod tests {
 
     const COLUMNS: u32 = 12;
     const ROWS: u32 = 9;
-    /// Above it everything that was reconstructed is left.
+    /// Rows above this one pass above everything that was reconstructed.
     const OUTLINE: u32 = 3;
 
-    /// Open water down to row 5 but for a mast in columns 4 and 5; a reef below, with a smooth stone of the
-    /// colour of open water in its middle.
+    /// Open water down to row 5, except for a mast in columns 4 and 5. Below is a reef with a smooth stone of
+    /// the colour of open water.
     fn view() -> (OfView, Vec<f64>) {
         let cells = || (0..ROWS).flat_map(|row| (0..COLUMNS).map(move |column| (row, column)));
         let is_mast = |row: u32, column: u32| row >= 1 && (4..6).contains(&column);
@@ -155,7 +154,7 @@ mod tests {
     }
 
     #[test]
-    fn open_water_goes_on_around_a_mast_and_down_to_the_reef_but_not_to_a_stone_of_its_colour() {
+    fn open_water_spreads_to_the_reef_but_not_to_a_stone_in_it() {
         let (view, off) = view();
         let map = ray_map(view, &off, 0.0, [4.0, 5.0]);
         for column in [0, 3, 6, 11] {
@@ -163,17 +162,17 @@ mod tests {
                 assert_eq!(at(&map, row, column), EndsOn::Open, "row {row}, column {column}");
             }
         }
-        assert_eq!(at(&map, 4, 4), EndsOn::Edge, "the mast's pixels are told apart");
+        assert_eq!(at(&map, 4, 4), EndsOn::Edge, "the mast's pixels are decided one by one");
         assert_eq!(
             [at(&map, 6, 0), at(&map, 7, 0), at(&map, 8, 0)],
             [EndsOn::Edge, EndsOn::Edge, EndsOn::Surface]
         );
-        assert_ne!(at(&map, 7, 8), EndsOn::Open, "nothing connects it with open water");
+        assert_ne!(at(&map, 7, 8), EndsOn::Open, "it is not connected with open water");
         assert!((f64::from(map.alike) - 5.0 / 255.0).abs() < 1e-6);
     }
 
     #[test]
-    fn open_water_ends_at_sighted_points_and_where_rays_go_steeply_down() {
+    fn open_water_ends_at_sighted_points_and_steep_rays() {
         let (mut view, off) = view();
         for column in 0..COLUMNS {
             view.near[(3 * COLUMNS + column) as usize] = true;
@@ -192,7 +191,7 @@ mod tests {
     }
 
     #[test]
-    fn what_looks_like_open_water_is_told_by_how_far_certain_cells_are_off() {
+    fn colour_tolerance_follows_the_certain_cells() {
         let [clean, rough] = [1.0_f32, 3.0].map(|spread| {
             let (mut view, _) = view();
             view.spread.fill(spread);

@@ -1,18 +1,18 @@
-//! Where photographs show open water, and how dark a scene is at each range: what pixels tell of the water
-//! beside the sparse points.
+//! Open water in photographs, and the darkest pixels at each range: evidence on the water beyond the sparse
+//! points.
 //!
-//! A ray ends on nothing where four things agree. It passes above everything that was reconstructed (`hull`).
-//! Its cell of the picture has no texture at any size (`cells`). No tracked point is near. And its colour is
-//! a smooth function of direction over all views (`colour`). Many such cells give the colour of open water
-//! with its errors: observations at infinite range. With that colour every view gets a map (`map`): open
-//! water, surface, unknown, or an edge where each pixel tells.
+//! A ray ends in open water if four conditions hold. It passes above everything that was reconstructed
+//! (`hull`). Its cell of the picture has no texture at any scale (`cells`). No tracked point is near. And its
+//! colour fits a smooth function of direction over all views (`colour`). Many such cells give the colour of
+//! open water with its errors: observations at infinite range. With that colour, every view gets a map
+//! (`map`) of open water, surface, unknown, and edges that are decided by pixel.
 //!
-//! The darkest pixels at each range bound the backscatter from above (SeaThru; Akkaynak & Treibitz, CVPR
-//! 2019). Ranges are those of the sparse points, around which pixels are gathered by range and direction
+//! The darkest pixels at each range are an upper bound of the backscatter (SeaThru; Akkaynak & Treibitz, CVPR
+//! 2019). Ranges are those of the sparse points; the pixels around them are collected by range and direction
 //! ([`DarkCell`]).
 //!
-//! Photographs are looked at once, each on one thread; sums run in the order of views: the same numbers on
-//! any number of threads.
+//! Each photograph is read once, on one thread, and sums run in the order of views. Results therefore do not
+//! depend on the number of threads.
 
 mod cells;
 mod colour;
@@ -32,46 +32,47 @@ use cells::Cells;
 use colour::{Candidate, FARTHEST, Fitted};
 use hull::{Hull, Levelled};
 
-/// Views from which the colour of open water and the darkest pixels are taken, evenly thinned.
+/// Maximum number of views, evenly thinned, for the colour of open water and the darkest pixels.
 const MOST_VIEWS: usize = 512;
-/// Photographs whose pixels are tallied at once: a tally takes 0.6 MB.
+/// Number of photographs tallied at once: a tally takes 0.6 MB.
 const BATCH: usize = 32;
-/// Points of a view without tracks, evenly thinned.
+/// Number of points projected into a view without tracks, evenly thinned.
 const UNTRACKED: usize = 32_768;
-/// Texture of the smoothest twentieth of all cells is noise; more than this is not, 8-bit codes.
+/// Upper limit of the estimated noise, 8-bit codes: the texture of the smoothest twentieth of all cells.
 const MOST_NOISE: f64 = 4.0;
 /// A cell is smooth up to `SMOOTH + 1.5 noise` of texture and `STRAIGHT + noise` of bend, 8-bit codes.
 const SMOOTH: f64 = 1.2;
 const STRAIGHT: f64 = 2.0;
-/// Least share of all cells that open water must have to be believed, and least number of views.
+/// Minimum share of all cells for open water, and minimum number of views.
 const LEAST_SHARE: f64 = 0.01;
 const LEAST_VIEWS: usize = 3;
-/// Least share of what may be open water that must agree on one colour by direction. In air, what passes
-/// above the scene is walls and windows: a fifth agreed on fox, 96 % and more on reefs.
+/// Minimum share of the candidate cells that must fit one colour by direction. In air, walls and windows are
+/// above the scene: a fifth agreed on fox, at least 96 % on reefs.
 const AGREEING: f64 = 0.6;
-/// The points of a cell lie on one surface where the farthest is nearer than this many times the nearest.
+/// The points of a cell lie on one surface if the farthest range is less than this many times the nearest.
 const MOST_DEPTH: f32 = 1.3;
-/// Pixels around a sparse point that are at its range, as a share of the longer side of the picture.
+/// Half-size of the square around a sparse point that is assumed at its range, as a share of the longer side
+/// of the picture.
 const AROUND: f64 = 1.0 / 148.0;
-/// Classes of range, elevation and azimuth of the darkest pixels.
+/// Numbers of classes of range, elevation and azimuth for the darkest pixels.
 const BY_RANGE: usize = 16;
 const BY_ELEVATION: usize = 4;
 const BY_AZIMUTH: usize = 3;
-/// Share of the pixels of a class that are darker than its dark.
+/// Share of the pixels of a class below its dark value.
 const DARKEST: f64 = 0.02;
-/// A class with fewer pixels says nothing.
+/// Minimum number of pixels of a usable class.
 const LEAST_PIXELS: u64 = 300;
-/// Observations of open water that fits take, evenly thinned.
+/// Maximum number of open-water observations in fits, evenly thinned.
 const MOST_OBSERVATIONS: usize = 400;
 
-/// What all pixels of a scene tell.
+/// The evidence from all pixels of a scene.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(super) struct Lookout {
-    /// Open water, where photographs show it.
+    /// Open water, if photographs show it.
     pub(super) open: Option<OpenWater>,
     /// The darkest pixels by range and direction.
     pub(super) dark: Vec<DarkCell>,
-    /// Up, right and forward of the levelled frame, where the cameras agree on one.
+    /// Up, right and forward of the levelled frame, if the cameras agree on one.
     pub(super) axes: Option<[DVec3; 3]>,
 }
 
@@ -81,15 +82,15 @@ pub struct OpenWater {
     fitted: Fitted,
     /// Share of the cells of all views that show it.
     pub share: f64,
-    /// Views that show it.
+    /// Number of views that show it.
     pub views: usize,
     /// Directions, unit length, scene axes, and colours, linear light.
     pub(super) seen: Vec<(DVec3, [f64; 3])>,
 }
 
 impl OpenWater {
-    /// Of the directions in which it was seen the one with the most usual colour, unit length, scene axes.
-    /// The mean of all is no such direction where cameras look around: it points up, where nobody looked.
+    /// The direction with the most typical colour among those observed, unit length, scene axes. The mean
+    /// direction would not do if cameras look around: it points up, where no camera looked.
     pub fn middle(&self) -> DVec3 {
         let unusual = |direction: DVec3| -> f64 {
             let offset = direction - self.fitted.middle;
@@ -99,13 +100,13 @@ impl OpenWater {
         seen.min_by(|a, b| unusual(*a).total_cmp(&unusual(*b))).map_or(DVec3::Z, DVec3::normalize)
     }
 
-    /// Its colour there, linear light, and the standard error of that.
+    /// Its colour in that direction, linear light, and the standard error of the colour.
     pub fn colour(&self) -> ([f64; 3], [f64; 3]) {
         let colour = self.fitted.along(self.middle());
         (colour, std::array::from_fn(|c| colour[c] * self.fitted.error[c]))
     }
 
-    /// How the logarithm of its colour changes with direction, scene axes.
+    /// Change of the logarithm of its colour with direction, scene axes.
     pub(super) fn slopes(&self) -> [DVec3; 3] {
         self.fitted.slopes
     }
@@ -118,13 +119,13 @@ pub(super) struct DarkCell {
     pub(super) range: f64,
     /// Mean direction, scene axes.
     pub(super) direction: DVec3,
-    /// Two in a hundred pixels are darker, linear light.
+    /// 2 % quantile of the pixels, linear light.
     pub(super) dark: [f64; 3],
-    /// Half of the pixels are darker, linear light.
+    /// Median of the pixels, linear light.
     pub(super) middle: [f64; 3],
 }
 
-/// Looks at the photographs of `source`; `scene_views` as [`super::observe`] takes them.
+/// Analyses the photographs of `source`; `scene_views` as in [`super::observe`].
 ///
 /// # Errors
 /// When a photograph cannot be read.
@@ -192,9 +193,9 @@ fn open_water(candidates: &[Candidate], cells: usize) -> Option<OpenWater> {
     Some(OpenWater { fitted, share, views: of_views.len(), seen })
 }
 
-/// What the rays of every view of `source` end on, with the colour `b_inf` of open water, linear light, and
-/// its factors by direction; where a job saw no open water, all end on surfaces. `scene_views` as
-/// [`super::observe`] takes them.
+/// The ray maps of every view of `source`. `open` holds the colour `b_inf` of open water, linear light, and
+/// its factors by direction. Without open water, all rays end on surfaces. `scene_views` as in
+/// [`super::observe`].
 ///
 /// # Errors
 /// When a photograph cannot be read.
@@ -230,8 +231,8 @@ pub fn ray_maps(
     Ok(map::ray_maps(looked, noise, along))
 }
 
-/// For each view the points that it saw: those whose track names it; of points without tracks, those in its
-/// picture.
+/// For each view, the points that it saw: those whose track contains it, or, without tracks, those projected
+/// into its picture.
 fn sighted(points: &Points, views: &[TrainView], scene_views: &[u32]) -> Result<Vec<Vec<u32>>> {
     if scene_views.len() != views.len() {
         return Err(CoreError::Scene(format!(
@@ -264,7 +265,7 @@ fn sighted(points: &Points, views: &[TrainView], scene_views: &[u32]) -> Result<
     Ok(sighted)
 }
 
-/// Cells of a view with what geometry says of them.
+/// Cells of a view with their geometry.
 struct OfView {
     columns: u32,
     rows: u32,
@@ -278,10 +279,10 @@ struct OfView {
     near: Vec<bool>,
     /// Whether the ray passes above everything that was reconstructed.
     leaves: Vec<bool>,
-    /// Whether it goes so far down that it ends somewhere.
+    /// Whether the ray points down so steeply that it must end on a surface.
     steep: Vec<bool>,
-    /// Range of the sighted points in the cell, scene units; 0 where there are none, or they lie far behind
-    /// each other.
+    /// Range of the sighted points in the cell, scene units; 0 without points, or if their ranges differ too
+    /// much.
     ranges: Vec<f32>,
 }
 
@@ -330,8 +331,8 @@ impl OfView {
     }
 }
 
-/// Of each of `columns` x `rows` cells of a view whether a sighted point lies in it or beside it, and the
-/// range of those in it.
+/// For each of `columns` x `rows` cells of a view, whether a sighted point lies in it or in a neighbour, and
+/// the range of the points in it.
 fn sightings(
     [columns, rows]: [u32; 2],
     points: &Points,
@@ -356,8 +357,8 @@ fn sightings(
     (near, seen.into_iter().map(range_of_cell).collect())
 }
 
-/// The middle of the ranges of a cell's points; 0 where there are none, or the farthest is much farther than
-/// the nearest.
+/// The median range of a cell's points; 0 without points, or if the farthest is much farther than the
+/// nearest.
 fn range_of_cell(mut ranges: Vec<f32>) -> f32 {
     ranges.sort_by(f32::total_cmp);
     match (ranges.first(), ranges.last()) {
@@ -386,7 +387,7 @@ struct Classes {
 }
 
 impl Classes {
-    /// With as many sighted points in each class of range, of elevation and of azimuth; `None` without
+    /// Classes with equal numbers of sighted points by range, by elevation and by azimuth; `None` without
     /// points.
     fn of(
         points: &Points,
@@ -434,9 +435,9 @@ impl Classes {
 
 /// Pixels by class.
 struct Tally {
-    /// By class and channel, how many pixels have each 8-bit code.
+    /// Histogram of 8-bit codes by class and channel.
     codes: Vec<[[u32; 256]; 3]>,
-    /// Sums of ranges and directions.
+    /// Sums of ranges and directions by class.
     sums: Vec<(f64, DVec3)>,
 }
 
@@ -446,8 +447,8 @@ impl Tally {
         Self { codes: vec![[[0; 256]; 3]; classes], sums: vec![(0.0, DVec3::ZERO); classes] }
     }
 
-    /// The pixels around the sighted points of a view, each at the range of the nearest to the camera that it
-    /// is around.
+    /// Counts the pixels around the sighted points of a view. A pixel near several points gets the smallest
+    /// of their ranges.
     fn of(
         image: &crate::views::PackedImage,
         classes: &Classes,
@@ -520,7 +521,7 @@ impl Tally {
     }
 }
 
-/// The code below which `below` of the pixels are, those of one code spread over it.
+/// The code below which `below` of the pixels lie; the pixels of one code are spread evenly over it.
 fn quantile_code(codes: &[u32; 256], below: f64) -> f64 {
     let mut passed = 0.0;
     for (code, count) in codes.iter().enumerate() {

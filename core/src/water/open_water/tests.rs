@@ -2,11 +2,11 @@ use super::fixture::{ALL, WATER, ahead, brighter_upwards, dive};
 use super::*;
 
 #[test]
-fn open_water_above_a_reef_is_found_with_its_colour_by_direction_and_mapped() {
+fn open_water_above_a_reef_is_found_and_mapped() {
     let truth = brighter_upwards();
     let dive = dive(ahead, |ray| truth.along(&WATER, ray).b_inf);
     let found = look_around(&dive.points, &dive.photographs, &ALL).unwrap();
-    let open = found.open.expect("a third of each photograph shows it");
+    let open = found.open.expect("a third of each photograph shows open water");
     assert!(open.views == 6 && open.share > 0.15, "{open:?}");
     let [colour, error] = <[_; 2]>::from(open.colour());
     let expected = truth.along(&WATER, open.middle()).b_inf;
@@ -15,12 +15,12 @@ fn open_water_above_a_reef_is_found_with_its_colour_by_direction_and_mapped() {
         assert!((colour[c] - expected[c]).abs() < 3.0 * error[c], "{error:?}");
         assert!((open.slopes()[c].y - truth.slopes[c][1]).abs() < 0.15, "{:?}", open.slopes());
     }
-    let told = ByDirection {
+    let found = ByDirection {
         middle: open.middle().to_array(),
         slopes: open.slopes().map(|slope| slope.to_array()),
         most: 1.0,
     };
-    let maps = ray_maps(&dive.points, &dive.photographs, &ALL, Some((colour, Some(&told)))).unwrap();
+    let maps = ray_maps(&dive.points, &dive.photographs, &ALL, Some((colour, Some(&found)))).unwrap();
     let (mut open_right, mut open_all, mut surface_wrong, mut surface_all) = (0, 0, 0, 0);
     let mut undecided = 0;
     for (map, floor) in maps.iter().zip(&dive.floor) {
@@ -45,7 +45,7 @@ fn open_water_above_a_reef_is_found_with_its_colour_by_direction_and_mapped() {
 }
 
 #[test]
-fn the_middle_is_a_direction_that_was_seen_where_cameras_look_around() {
+fn middle_is_an_observed_direction_when_cameras_look_around() {
     let truth = brighter_upwards();
     let around = |k: f64| {
         let (sin, cos) = (k * std::f64::consts::TAU / 6.0).sin_cos();
@@ -54,12 +54,12 @@ fn the_middle_is_a_direction_that_was_seen_where_cameras_look_around() {
     let dive = dive(around, |ray| truth.along(&WATER, ray).b_inf);
     let open = look_around(&dive.points, &dive.photographs, &ALL).unwrap().open.unwrap();
     let up = -open.middle().y;
-    assert!((0.0..0.4).contains(&up), "{} looks {up} upwards", open.middle());
+    assert!((0.0..0.4).contains(&up), "{} points {up} upwards", open.middle());
     assert!((open.middle().length() - 1.0).abs() < 1e-9);
 }
 
 #[test]
-fn the_darkest_pixels_of_each_range_are_the_veil_where_something_is_black() {
+fn darkest_pixels_are_the_veil_if_something_is_black() {
     let dive = dive(ahead, |_| WATER.b_inf);
     let found = look_around(&dive.points, &dive.photographs, &ALL).unwrap();
     assert!(found.dark.len() > 20, "{}", found.dark.len());
@@ -75,20 +75,20 @@ fn the_darkest_pixels_of_each_range_are_the_veil_where_something_is_black() {
 }
 
 #[test]
-fn a_survey_that_looks_down_and_a_room_above_a_scene_have_no_open_water() {
+fn downward_surveys_and_rooms_have_no_open_water() {
     let down = dive(
         |k| (DVec3::new(2.0 * k - 5.0, -2.0, 0.1), DVec3::new(2.0 * k - 5.0, 2.0, 0.3)),
         |_| WATER.b_inf,
     );
     assert_eq!(look_around(&down.points, &down.photographs, &ALL).unwrap().open, None);
-    // Walls of other colours in each direction.
+    // Walls of different colours by direction.
     let walls = [[0.5, 0.4, 0.3], [0.1, 0.3, 0.1], [0.05, 0.05, 0.4], [0.9, 0.9, 0.8]];
     let room = dive(ahead, |ray| walls[((8.0 * (ray.x + 1.0)) as usize) % 4]);
     assert_eq!(look_around(&room.points, &room.photographs, &ALL).unwrap().open, None);
 }
 
 #[test]
-fn the_same_photographs_tell_the_same_on_any_number_of_threads() {
+fn result_does_not_depend_on_the_number_of_threads() {
     let dive = dive(ahead, |ray| brighter_upwards().along(&WATER, ray).b_inf);
     let look = || look_around(&dive.points, &dive.photographs, &ALL).unwrap();
     let alone = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap().install(look);

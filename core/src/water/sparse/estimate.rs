@@ -1,5 +1,5 @@
-//! The numbers of one channel: from nine starts through rounds of weights and least squares, with standard
-//! errors.
+//! The parameters of one channel and their standard errors: nine starts, then rounds of reweighting and least
+//! squares.
 
 use rayon::prelude::*;
 
@@ -8,22 +8,21 @@ use super::least_squares::{Channel, Modelled, Sought, best_clear, median_clear};
 use super::robust::{Loss, Residual, Weights, code_step, quantile};
 use crate::water::solve::covariance;
 
-/// Points from which starts are judged.
+/// Number of points used to choose a start.
 const START_POINTS: usize = 600;
-/// Points on which the numbers settle before all are taken.
+/// Number of points used until the parameters settle, before all points are used.
 const SETTLE_POINTS: usize = 5000;
-/// Rounds of new weights.
+/// Maximum number of reweighting rounds.
 const ROUNDS: usize = 25;
-/// By what share a start seems worse than it is where backscatter grows e times faster or slower than the
-/// direct signal fades: for a factor of 2 0.5 %, for one of 7 4 %. Both come of the same water; and where
-/// they are the same, J T + B (1 - T) = (J - B) T + B, so that a veil which is all there before the first
-/// point explains as much, with darker points. Its cost is within 0.5 % of the other one's, at times below
-/// it.
+/// Relative cost penalty of a start per squared logarithm of beta_b / beta_d: 0.5 % for a factor of 2, 4 %
+/// for a factor of 7. Both come from the same water. If they are equal, J T + B (1 - T) = (J - B) T + B: a
+/// veil complete before the first point explains as much, with darker points. Its cost is within 0.5 % of the
+/// other one, and sometimes lower.
 const UNLIKE: f64 = 0.01;
-/// Standard errors from which a number counts as unknown: of beta times the median range, and of `b_inf`.
+/// Standard error from which a parameter is unknown: of beta times the median range, and of `b_inf`.
 const UNKNOWN: [f64; 3] = [3.0, 3.0, 1.0];
 
-/// The cost of a start with [`UNLIKE`] in it. Numbers so small that they make no difference make none here.
+/// The cost of a start with the [`UNLIKE`] penalty. The penalty vanishes for negligible coefficients.
 fn seeming(cost: f64, [beta_d, beta_b, _]: [f64; 3]) -> f64 {
     let ratio = (beta_b + 0.01) / (beta_d + 0.01);
     cost * (1.0 + UNLIKE * ratio.ln().powi(2))
@@ -38,7 +37,8 @@ pub(super) struct Estimate {
 }
 
 impl Channel {
-    /// Residuals and what they are made of, in the order of the observations; `of_point` finds J.
+    /// Residuals with their direct signal and modelled colour, in the order of the observations; `of_point`
+    /// finds J.
     fn residuals(
         &self,
         numbers: [f64; 3],
@@ -48,7 +48,7 @@ impl Channel {
         let by_chunk = self.by_chunks(numbers, Vec::new, |found: &mut Vec<Residual>, own, modelled| {
             let (values, weights) = (&self.values[own.clone()], &weights[own]);
             let clear = of_point(modelled, values, weights);
-            // J follows the mean of n residuals, so n - 1 of them are free.
+            // J follows the mean of n residuals, which leaves n - 1 degrees of freedom.
             let freedom = 1.0 - 1.0 / values.len() as f64;
             found.extend(modelled.iter().zip(values).map(|(m, value)| {
                 let direct = clear * m.through;
@@ -58,7 +58,7 @@ impl Channel {
         by_chunk.into_iter().flatten().collect()
     }
 
-    /// Rounds of weights and least squares until the numbers stand still.
+    /// Alternates weights and least squares until the parameters settle.
     fn settle(
         &self,
         mut numbers: [f64; 3],
@@ -67,7 +67,7 @@ impl Channel {
         sought: Sought,
         rounds: usize,
     ) -> ([f64; 3], Weights) {
-        // Least squares alone would give a point to its one outlier where that is far from the rest.
+        // Least squares alone would fit J to a single outlier far from the rest.
         let mut found = self.reweight(&self.residuals(numbers, &weights, median_clear), loss);
         let least_squares =
             |m: &[Modelled], values: &[f64], weights: &[f64]| best_clear(m, values, weights).0;
@@ -83,8 +83,8 @@ impl Channel {
         (numbers, found)
     }
 
-    /// Weights that know nothing but the colours: by what a code is worth at the mean colour of the point,
-    /// and by how many share the shade.
+    /// Initial weights from colours alone: by the size of a code at the mean colour of the point, and by the
+    /// number of observations of the shade.
     fn first_weights(&self) -> Vec<f64> {
         let mut weights = Vec::with_capacity(self.values.len());
         for own in self.starts.windows(2) {
@@ -96,11 +96,11 @@ impl Channel {
         weights
     }
 
-    /// The best of nine starts on some of the points, by the mean absolute residual in 8-bit codes and
-    /// [`UNLIKE`].
+    /// The best of nine starts on a subset of the points, by the mean absolute residual in 8-bit codes and
+    /// the [`UNLIKE`] penalty.
     fn start(&self) -> [f64; 3] {
         let some = self.thinned(START_POINTS);
-        // A colour that the backscatter may have: a tenth of the observations is darker.
+        // A plausible backscatter colour: a tenth of the observations are darker.
         let veil = quantile(&mut some.values.clone(), 0.1).clamp(0.002, 0.9);
         let weights = some.first_weights();
         let starts: Vec<[f64; 3]> =
@@ -119,8 +119,8 @@ impl Channel {
         best.map_or([0.5, 0.5, veil], |(_, numbers)| numbers)
     }
 
-    /// The numbers by some of the points, and the colour that each observation has under them; `None` where
-    /// there are too few.
+    /// The parameters from a subset of the points, and the modelled colour of each observation; `None` with
+    /// too few points.
     pub(super) fn rough(&self) -> Option<([f64; 3], Vec<f64>)> {
         if self.points.len() < MIN_POINTS {
             return None;
@@ -131,15 +131,15 @@ impl Channel {
         Some((numbers, seen.into_iter().map(|residual| residual.seen).collect()))
     }
 
-    /// The numbers with their errors, from those by [`Channel::rough`].
+    /// The parameters with their errors, starting from those of [`Channel::rough`].
     pub(super) fn estimate(&self, rough: Option<[f64; 3]>) -> Estimate {
         let Some(rough) = rough else {
-            // The other channels may have more: a lamp saturates red only.
+            // The other channels may still have enough points: a lamp saturates red only.
             let weights = vec![0.0; self.values.len()];
             return Estimate { numbers: [0.0; 3], standard_error: [f64::INFINITY; 3], weights, inliers: 1.0 };
         };
-        // Where the numbers settle, and how far other choices move them, some of the points show as well as
-        // all.
+        // A subset of the points is enough to settle the parameters and to measure how other choices change
+        // them.
         let some = self.thinned(SETTLE_POINTS);
         let (of_some, found) = some.settle(rough, some.first_weights(), Loss::Tukey, Sought::All, ROUNDS);
         let systematic = some.systematic(of_some, &found, Sought::All);
@@ -155,16 +155,16 @@ impl Channel {
             std::array::from_fn(|k| if errors[k] < UNKNOWN[k] { errors[k] } else { f64::INFINITY })
         };
         errors = bounded(errors);
-        // Without backscatter its growth means nothing; and its limit is seen only where it grows, or has
-        // grown up long before the median range.
+        // Without backscatter, its growth has no meaning. Its limit is visible only if it grows, or is
+        // complete well before the median range.
         let is_there = [1, 2].map(|k| numbers[k] > 2.0 * errors[k]);
         if !is_there[1] || (!is_there[0] && numbers[1] < 1.0) {
             errors[1] = f64::INFINITY;
             errors[2] = f64::INFINITY;
         }
-        // What is unknown gets a usual value, and the others follow: backscatter grows towards no more than
-        // the colour of what is far away, and as the direct signal fades where it would be all but grown up
-        // before the first observation.
+        // Unknown parameters get typical values, and the others are fitted again. Backscatter is limited to
+        // the colour far away. If it would be nearly complete before the first observation, it grows as the
+        // direct signal fades.
         let far_colour = self.far_colour();
         let usual = if errors[2].is_infinite() && numbers[2] > far_colour {
             Some((
@@ -183,22 +183,22 @@ impl Channel {
             errors[0] = errors[0].hypot(numbers[0] - before);
             errors = bounded(errors);
         }
-        // Points that grow brighter with their range, as those of a lit sea floor may, are no backscatter
-        // where other choices give another growth altogether. A veil that is not there takes the dark from
-        // the scene; so it grows only as the direct signal fades.
+        // Points that get brighter with range, as on a lit sea floor, are not evidence of backscatter if
+        // other choices change the growth completely. A false veil would remove dark colours from the scene,
+        // so beta_b is set to beta_d.
         if errors[1].is_infinite() && errors[2].is_infinite() && !some.has_growth(numbers) {
             numbers[1] = numbers[0];
         }
         Estimate { numbers, standard_error: errors, weights: found.weights, inliers: found.inliers }
     }
 
-    /// Attenuation of a channel whose veil was taken away, and its standard error, infinite where nothing
-    /// tells.
+    /// The attenuation of a channel after its veil was removed, and its standard error, infinite if
+    /// undetermined.
     pub(super) fn attenuation(&self) -> [f64; 2] {
         if self.points.len() < MIN_POINTS {
             return [0.0, f64::INFINITY];
         }
-        // No attenuation is not the end of what it can be seen to be.
+        // An attenuation of 0 must not be the end of the scale, so that amplification can be measured.
         let [faded, error] = self.clone().faded().attenuation_from(1.0);
         if faded <= 1.0 {
             return [0.0, error.hypot(1.0 - faded)];
@@ -216,15 +216,15 @@ impl Channel {
         [numbers[0], if error < UNKNOWN[0] { error } else { f64::INFINITY }]
     }
 
-    /// The median of the farthest twentieth of the observations.
+    /// The median value of the farthest twentieth of the observations.
     fn far_colour(&self) -> f64 {
         let far = quantile(&mut self.ranges.clone(), 0.95);
         let seen = self.ranges.iter().zip(&self.values).filter(|(range, _)| **range >= far);
         quantile(&mut seen.map(|(_, value)| *value).collect::<Vec<_>>(), 0.5)
     }
 
-    /// Variances of the numbers by the scatter of the points and the rounding of shades alone; of a limit
-    /// that is not sought 0.
+    /// Variances of the parameters from the scatter of points and the rounding of shades alone; 0 for a fixed
+    /// limit.
     fn variance(&self, numbers: [f64; 3], found: &Weights, sought: Sought) -> [f64; 3] {
         let mut at = self.normal(numbers, &found.weights);
         let rounding = self.scatter_of_rounding(numbers, &found.weights);
@@ -245,8 +245,8 @@ impl Channel {
         covariance(at.hessian, at.scatter).map(|variance| variance * found.overstated.powi(2))
     }
 
-    /// Squares of how far the numbers move under another loss, between darker and brighter points, and with
-    /// smaller windows: what the model of image and noise leaves out.
+    /// Squared changes of the parameters under another loss, between darker and brighter points, and with
+    /// smaller windows. They estimate the errors of the image and noise models.
     fn systematic(&self, numbers: [f64; 3], found: &Weights, sought: Sought) -> [f64; 3] {
         let (under_huber, _) = self.settle(numbers, found.weights.clone(), Loss::Huber, sought, 10);
         let finer = self.finer();
@@ -269,7 +269,7 @@ impl Channel {
             let half = self.selected(points.into_iter());
             half.settle(numbers, half.first_weights(), Loss::Tukey, sought, 10).0
         });
-        // Halves differ by chance too, by twice the standard error of both together.
+        // Halves also differ by chance, by twice the standard error of the whole.
         let chance = self.variance(numbers, found, sought);
         std::array::from_fn(|k| {
             let between = (halves[1][k] - halves[0][k]) / 2.0;
@@ -278,7 +278,7 @@ impl Channel {
         })
     }
 
-    /// Whether backscatter grows beyond doubt towards the limit that `numbers` have.
+    /// Whether backscatter clearly grows towards the limit in `numbers`.
     fn has_growth(&self, numbers: [f64; 3]) -> bool {
         let sought = Sought::WithoutLimit;
         let (numbers, found) = self.settle(numbers, self.first_weights(), Loss::Tukey, sought, ROUNDS);
@@ -286,7 +286,7 @@ impl Channel {
         numbers[1] > 2.0 * (self.variance(numbers, &found, sought)[1] + systematic[1]).sqrt()
     }
 
-    /// J of each of `points` points, by the smaller windows: what is blurred less.
+    /// J of each of `points` points, from the smaller windows, which are less blurred.
     pub(super) fn clear(&self, estimate: &Estimate, points: usize) -> Vec<Option<f64>> {
         let mut found = vec![None; points];
         for (point, own) in self.points.iter().zip(self.starts.windows(2)) {
@@ -304,12 +304,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_veil_that_is_all_there_at_once_must_be_clearly_better_than_one_that_grows_as_light_fades() {
-        // Green of the wreck in turbid water: the truth, and what explains the points as well.
+    fn veil_complete_at_once_needs_a_clearly_lower_cost() {
+        // Green channel of the wreck in turbid water: the truth, and an alternative that explains the points
+        // as well.
         let (growing, at_once) = ([2.0, 2.16, 0.101], [2.0, 5.95, 0.101]);
         assert!(seeming(4419.0, growing) < seeming(4409.0, at_once));
         assert!(seeming(4419.0, growing) > seeming(4300.0, at_once), "evidence counts");
-        // In air both are next to nothing, and their ratio says nothing.
+        // In air both are negligible, and so is their ratio's penalty.
         assert!(seeming(100.0, [1e-6, 1e-3, 0.1]) < 100.02);
     }
 }

@@ -1,4 +1,5 @@
-//! Least squares for one channel of the water under fixed weights, with J of each point eliminated.
+//! Least squares for the water parameters of one channel under fixed weights, with J of each point
+//! eliminated.
 
 use rayon::prelude::*;
 
@@ -8,46 +9,46 @@ use super::shades::{ROUNDING, crowds_of};
 use crate::water::Water;
 use crate::water::solve::{Matrix, solve};
 
-/// Points of a chunk whose sums one thread makes.
+/// Points per chunk; each chunk is summed by one thread.
 const CHUNK: usize = 256;
-/// Unconstrained numbers stay within this: softplus and sigmoid of it are 1e-6 from their ends.
+/// Limit of the absolute unconstrained parameters: at it, softplus and sigmoid are within 1e-6 of their ends.
 const RAW_LIMIT: f64 = 14.0;
 
-/// Observations of one channel, point by point. Ranges are in units of the median range, so the numbers
-/// sought have no unit: `[beta_d, beta_b, b_inf]` with betas times that range.
+/// Observations of one channel, point by point. Ranges are in units of the median range, so the unknowns have
+/// no unit: `[beta_d, beta_b, b_inf]`, with the betas multiplied by that range.
 #[derive(Clone, Default)]
 pub(super) struct Channel {
     pub(super) ranges: Vec<f64>,
     pub(super) values: Vec<f64>,
-    /// The same of smaller windows.
+    /// Values from the smaller windows.
     pub(super) finer: Vec<f64>,
-    /// Factor on the limit of the backscatter along the ray of each.
+    /// Factor on the limit of the backscatter along each ray.
     tints: Vec<f64>,
-    /// Which observation it is.
+    /// Index of each observation.
     pub(super) observed: Vec<u32>,
-    /// Which shade it has ([`shades`](super::shades)).
+    /// Shade of each observation ([`shades`](super::shades)).
     shades: Vec<u32>,
-    /// How many observations have that shade.
+    /// Number of observations with the same shade.
     pub(super) crowds: Vec<f64>,
-    /// Where the observations of each point start, and the end of the last.
+    /// Start of the observations of each point, and the end of the last.
     pub(super) starts: Vec<usize>,
-    /// Which point it is.
+    /// Index of each point.
     pub(super) points: Vec<u32>,
 }
 
-/// Which of the three numbers are sought.
+/// Which of the three parameters are optimised.
 #[derive(Clone, Copy, PartialEq)]
 pub(super) enum Sought {
     All,
-    /// beta_b is beta_d.
+    /// beta_b equals beta_d.
     WithoutGrowth,
-    /// b_inf stays as it is.
+    /// b_inf is fixed.
     WithoutLimit,
-    /// beta_b and b_inf stay as they are.
+    /// beta_b and b_inf are fixed.
     Attenuation,
 }
 
-/// Sums of one pass: the cost and its normal equations.
+/// Sums of one pass: the cost and the normal equations.
 #[derive(Clone, Copy, Default)]
 pub(super) struct Normal {
     pub(super) cost: f64,
@@ -71,7 +72,7 @@ impl Normal {
     }
 }
 
-/// What the model says of one observation.
+/// Model of one observation.
 #[derive(Clone, Copy)]
 pub(super) struct Modelled {
     /// exp(-beta_d r).
@@ -89,27 +90,28 @@ pub(super) fn model([beta_d, beta_b, b_inf]: [f64; 3], range: f64, tint: f64) ->
     Modelled { through: (-beta_d * range).exp(), veil: tint * b_inf * (1.0 - unveiled), unveiled, tint }
 }
 
-/// J of one point and the sum of squares that it was divided by.
+/// J of one point, and the sum of squares in its denominator.
 pub(super) fn best_clear(modelled: &[Modelled], values: &[f64], weights: &[f64]) -> (f64, f64) {
     let (mut above, mut below) = (0.0, 0.0);
     for ((m, value), weight) in modelled.iter().zip(values).zip(weights) {
         above += weight * m.through * (value - m.veil);
         below += weight * m.through * m.through;
     }
-    // Where nothing comes through (or all weights are 0) J is anything: 0 is as good as any.
+    // If no light comes through (or all weights are 0), any J fits; 0 is as good as any.
     (if below > 1e-200 { (above / below).max(0.0) } else { 0.0 }, below)
 }
 
-/// J of one point as the median of what its observations say, each counting as it does in a sum of absolute
+/// J of one point as the weighted median over its observations. Each has its weight in a sum of absolute
 /// residuals.
 pub(super) fn median_clear(modelled: &[Modelled], values: &[f64], weights: &[f64]) -> f64 {
-    let said = modelled.iter().zip(values).zip(weights).filter(|((m, _), _)| m.through > 1e-100);
-    let mut said: Vec<(f64, f64)> =
-        said.map(|((m, value), weight)| ((value - m.veil) / m.through, weight.sqrt() * m.through)).collect();
-    said.sort_by(|a, b| a.0.total_cmp(&b.0));
-    let half = said.iter().map(|(_, weight)| weight).sum::<f64>() / 2.0;
+    let estimates = modelled.iter().zip(values).zip(weights).filter(|((m, _), _)| m.through > 1e-100);
+    let mut estimates: Vec<(f64, f64)> = estimates
+        .map(|((m, value), weight)| ((value - m.veil) / m.through, weight.sqrt() * m.through))
+        .collect();
+    estimates.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let half = estimates.iter().map(|(_, weight)| weight).sum::<f64>() / 2.0;
     let mut below = 0.0;
-    let median = said.iter().find(|(_, weight)| {
+    let median = estimates.iter().find(|(_, weight)| {
         below += weight;
         below >= half
     });
@@ -117,14 +119,14 @@ pub(super) fn median_clear(modelled: &[Modelled], values: &[f64], weights: &[f64
 }
 
 impl Channel {
-    /// Points with fewer than two observations are left out: any water explains them. No two have a shade in
-    /// common.
+    /// Leaves out points with fewer than two observations: any water explains them. Every observation starts
+    /// with a shade of its own.
     pub(super) fn of(observations: &[Observation], order: &[u32], c: usize, unit: f64) -> Self {
         let seen = |index: u32| &observations[index as usize];
         let mut channel = Self { starts: vec![0], ..Self::default() };
         for of_point in order.chunk_by(|&a, &b| seen(a).point == seen(b).point) {
-            let says = |seen: &Observation| seen.colour[c].is_finite() && seen.finer[c].is_finite();
-            let counting = of_point.iter().filter(|&&index| says(seen(index)));
+            let usable = |seen: &Observation| seen.colour[c].is_finite() && seen.finer[c].is_finite();
+            let counting = of_point.iter().filter(|&&index| usable(seen(index)));
             if counting.clone().count() < 2 {
                 continue;
             }
@@ -143,7 +145,7 @@ impl Channel {
         channel
     }
 
-    /// The same with the shade that each of the observations has.
+    /// Sets the shade of each observation.
     #[must_use]
     pub(super) fn with_shades(mut self, of_observations: &[u32]) -> Self {
         self.shades = self.observed.iter().map(|index| of_observations[*index as usize]).collect();
@@ -151,7 +153,7 @@ impl Channel {
         self
     }
 
-    /// The same without a veil that is known: `veil` gives it by observation.
+    /// Subtracts a known veil; `veil` returns it by observation.
     #[must_use]
     pub(super) fn without(mut self, veil: impl Fn(usize) -> f64) -> Self {
         for (at, index) in self.observed.iter().enumerate() {
@@ -162,7 +164,7 @@ impl Channel {
         self
     }
 
-    /// The same as it would look if light faded by e more in a median range.
+    /// Adds an attenuation of 1 / median range: light is reduced by a factor of e per median range.
     #[must_use]
     pub(super) fn faded(mut self) -> Self {
         for (at, range) in self.ranges.iter().enumerate() {
@@ -173,7 +175,7 @@ impl Channel {
         self
     }
 
-    /// What the model says of the observations `own`.
+    /// The model of the observations `own`.
     pub(super) fn modelled(
         &self,
         numbers: [f64; 3],
@@ -183,12 +185,12 @@ impl Channel {
         seen.map(move |(range, tint)| model(numbers, *range, *tint))
     }
 
-    /// The same points with what smaller windows show.
+    /// The same points with the values of the smaller windows.
     pub(super) fn finer(&self) -> Self {
         Self { values: self.finer.clone(), ..self.clone() }
     }
 
-    /// Every n-th point.
+    /// Every n-th point, so that at most `most` remain.
     pub(super) fn thinned(&self, most: usize) -> Self {
         self.selected((0..self.points.len()).step_by(self.points.len().div_ceil(most).max(1)))
     }
@@ -210,8 +212,8 @@ impl Channel {
         thin
     }
 
-    /// Runs `work` on the observations of each point (their indices and what the model says of them) and
-    /// gathers what it gives by chunks of points, in order.
+    /// Runs `work` on the observations of each point (their indices and models) and collects the results by
+    /// chunks of points, in order.
     pub(super) fn by_chunks<T: Send>(
         &self,
         numbers: [f64; 3],
@@ -233,15 +235,16 @@ impl Channel {
             .collect()
     }
 
-    /// Of each observation of one point its index, its residual, its modelled colour, and what the numbers
-    /// change of its residual, less what J takes over of it.
+    /// Calls `each` for every observation of a point with its index, residual, modelled colour, and
+    /// derivatives of the colour with respect to the parameters. The part of the derivatives that J absorbs
+    /// is subtracted.
     fn sensitivities(
         &self,
         b_inf: f64,
         own: std::ops::Range<usize>,
         modelled: &[Modelled],
         weights: &[f64],
-        mut told: impl FnMut(usize, f64, f64, [f64; 3]),
+        mut each: impl FnMut(usize, f64, f64, [f64; 3]),
     ) {
         let (values, weights) = (&self.values[own.clone()], &weights[own.clone()]);
         let ranges = &self.ranges[own.clone()];
@@ -249,7 +252,7 @@ impl Channel {
         let derivatives = |m: &Modelled, range: f64| {
             [-clear * range * m.through, m.tint * b_inf * range * m.unveiled, m.tint * (1.0 - m.unveiled)]
         };
-        // Nothing where J is held at 0.
+        // Zero if J is held at 0.
         let mut taken = [0.0; 3];
         if clear > 0.0 {
             for ((m, range), weight) in modelled.iter().zip(ranges).zip(weights) {
@@ -260,7 +263,7 @@ impl Channel {
         for (((m, range), value), index) in modelled.iter().zip(ranges).zip(values).zip(own) {
             let seen = m.veil + clear * m.through;
             let by = derivatives(m, *range);
-            told(index, value - seen, seen, std::array::from_fn(|k| by[k] - taken[k] * m.through));
+            each(index, value - seen, seen, std::array::from_fn(|k| by[k] - taken[k] * m.through));
         }
     }
 
@@ -288,8 +291,8 @@ impl Channel {
         sums.iter().fold(Normal::default(), Normal::add)
     }
 
-    /// Sum over shades of the outer product of the gradient that its rounding makes: [`ROUNDING`] codes in
-    /// all its observations.
+    /// Sum over shades of the outer product of the gradient caused by a rounding error of [`ROUNDING`] codes
+    /// in all observations of the shade.
     pub(super) fn scatter_of_rounding(&self, numbers: [f64; 3], weights: &[f64]) -> Matrix {
         let by_chunk = self.by_chunks(numbers, Vec::new, |found: &mut Vec<[f64; 3]>, own, modelled| {
             self.sensitivities(numbers[2], own, modelled, weights, |index, _, seen, by| {
@@ -328,7 +331,7 @@ impl Channel {
             let mut hessian: Matrix =
                 std::array::from_fn(|j| std::array::from_fn(|k| at.hessian[j][k] * slope[j] * slope[k]));
             if sought == Sought::WithoutGrowth {
-                // One unknown in place of two; the second has nothing left to say.
+                // One unknown in place of two; the second is held.
                 gradient[0] += gradient[1];
                 hessian[0][0] += 2.0 * hessian[0][1] + hessian[1][1];
                 hessian[0][2] += hessian[1][2];
@@ -383,12 +386,12 @@ impl Channel {
     }
 }
 
-/// A water that is the same in all channels.
+/// A water with equal channels.
 fn water_of([beta_d, beta_b, b_inf]: [f64; 3]) -> Water {
     Water { beta_d: [beta_d; 3], beta_b: [beta_b; 3], b_inf: [b_inf; 3] }
 }
 
-/// The unconstrained numbers of one channel.
+/// The unconstrained parameters of one channel.
 fn to_raw(numbers: [f64; 3]) -> [f64; 3] {
     let raw = water_of(numbers).to_raw(1.0);
     [raw[0], raw[3], raw[6]].map(|value| value.clamp(-RAW_LIMIT, RAW_LIMIT))

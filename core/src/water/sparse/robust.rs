@@ -1,4 +1,4 @@
-//! Weights of observations: what noise they have, and how little outliers and odd points count.
+//! Weights of observations: their noise, and the reduced weights of outliers and odd points.
 
 use super::least_squares::Channel;
 use super::shades::ROUNDING;
@@ -10,7 +10,7 @@ const TUKEY: f64 = 4.685;
 const HUBER: f64 = 1.345;
 /// Median absolute deviation of a Gaussian to its standard deviation.
 const MAD_TO_SIGMA: f64 = 1.4826;
-/// Degrees of freedom of the weight of a whole point.
+/// Degrees of freedom for the weight of a whole point.
 const POINT_FREEDOM: f64 = 4.0;
 
 #[derive(Clone, Copy, PartialEq)]
@@ -21,7 +21,7 @@ pub(super) enum Loss {
 
 /// One observation against the model.
 pub(super) struct Residual {
-    /// Seen less modelled, as large as if J were not fitted to it, linear light.
+    /// Observed minus modelled colour, scaled as if J were not fitted to it, linear light.
     pub(super) error: f64,
     /// Modelled direct signal.
     pub(super) direct: f64,
@@ -32,10 +32,10 @@ pub(super) struct Residual {
 /// Result of [`Channel::reweight`].
 pub(super) struct Weights {
     pub(super) weights: Vec<f64>,
-    /// Sum of the weights by the sum of the slopes of psi: the bread of the sandwich has weights in place of
-    /// slopes.
+    /// Sum of the weights divided by the sum of the slopes of psi: the bread of the sandwich has weights in
+    /// place of slopes.
     pub(super) overstated: f64,
-    /// Share of observations within Tukey's limit.
+    /// Share of the observations within Tukey's limit.
     pub(super) inliers: f64,
 }
 
@@ -43,14 +43,14 @@ pub(super) struct Weights {
 struct Noise([f64; 3]);
 
 impl Noise {
-    /// Squares of an 8-bit code, of photons and of texture.
+    /// Variance terms of 8-bit quantisation, of photons and of texture.
     fn parts(residual: &Residual) -> [f64; 3] {
         let seen = residual.seen.max(1e-4);
         [code_step(seen).powi(2), 1e-3 * seen, residual.direct * residual.direct + 1e-12]
     }
 
-    /// Fitted to the squares of the residuals, cut off at six variances: Gaussian noise has next to nothing
-    /// there.
+    /// Fits the noise to the squared residuals, clipped at six variances, beyond which Gaussian noise is
+    /// negligible.
     fn of(residuals: &[Residual]) -> Self {
         const MOST: usize = 40_000;
         let some: Vec<(f64, [f64; 3])> = residuals
@@ -82,7 +82,7 @@ impl Noise {
     }
 
     fn variances(&self, residuals: &[Residual]) -> Vec<f64> {
-        // A mean over a few pixels does not know a colour better than to a thirtieth of a code.
+        // A mean over a few pixels is accurate to about a thirtieth of a code at best.
         const FLOOR: f64 = 1e-3;
         let of = |residual: &Residual| {
             let parts = Self::parts(residual);
@@ -93,13 +93,13 @@ impl Noise {
 }
 
 impl Channel {
-    /// What the observation's variance is more for the rounding that it shares, so that all of a shade
-    /// together weigh as much as one of them without other noise; of the colour `seen`.
+    /// Additional variance of an observation with the colour `seen` for its shared rounding error. With it,
+    /// all observations of a shade together weigh as much as one of them without other noise.
     pub(super) fn rounding_variance(&self, index: usize, seen: f64) -> f64 {
         (self.crowds[index] - 1.0) * (ROUNDING * code_step(seen.max(1e-4))).powi(2)
     }
 
-    /// Weights of the next round, and the ratio by which they overstate how sure the numbers are.
+    /// Weights of the next round, and the factor by which they overstate the certainty of the parameters.
     pub(super) fn reweight(&self, residuals: &[Residual], loss: Loss) -> Weights {
         let variances = Noise::of(residuals).variances(residuals);
         let mut scaled: Vec<f64> = residuals
@@ -146,20 +146,20 @@ impl Channel {
         }
         Weights {
             weights,
-            // At least a tenth: with hardly any observation inside there is nothing to be sure of anyway.
+            // At least a tenth: with hardly any inliers, the result is uncertain anyway.
             overstated: sum / slope.max(0.1 * sum).max(1e-30),
             inliers: inside as f64 / scaled.len().max(1) as f64,
         }
     }
 }
 
-/// What one 8-bit code is worth at this linear light: the derivative of the inverse sRGB curve by 255.
+/// Size of one 8-bit code at this linear light: the derivative of the inverse sRGB curve, divided by 255.
 pub(super) fn code_step(linear: f64) -> f64 {
     let encoded = linear_to_srgb(linear.clamp(0.0, 1.0));
     srgb_slope(encoded) / 255.0
 }
 
-/// The value below which `share` of the values lie; 0 of none. Their order changes.
+/// The value below which `share` of the values lie; 0 for an empty slice. Reorders the values.
 pub(super) fn quantile(values: &mut [f64], share: f64) -> f64 {
     if values.is_empty() {
         return 0.0;
