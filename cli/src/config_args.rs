@@ -247,7 +247,7 @@ mod tests {
     }
 
     #[test]
-    fn a_preset_is_what_other_settings_stand_on() {
+    fn other_settings_build_on_the_preset() {
         use fathom_core::config::{Medium, Preset};
         let of = |preset: &str, set: &[&str]| {
             let set = set.iter().map(|setting| (*setting).to_owned()).collect();

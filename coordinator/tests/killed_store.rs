@@ -34,13 +34,13 @@ const DIR: &str = "FATHOM_TEST_KILLED_STORE";
 const ROUND: &str = "FATHOM_TEST_KILLED_STORE_ROUND";
 
 #[test]
-fn what_was_acknowledged_survives_sigkill() {
+fn acknowledged_changes_survive_sigkill() {
     kill_again_and_again(6);
 }
 
 #[test]
 #[ignore = "takes minutes"]
-fn what_was_acknowledged_survives_hundreds_of_sigkills() {
+fn acknowledged_changes_survive_hundreds_of_sigkills() {
     kill_again_and_again(300);
 }
 

@@ -560,7 +560,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn what_is_no_coordinator_is_told_from_one_that_is_away() {
+    async fn other_servers_differ_from_an_absent_coordinator() {
         let alert: &[u8] = &[0x15, 3, 3, 0, 2, 2, 10];
         let settings: &[u8] = &[0, 0, 0, 4, 0, 0, 0, 0, 0];
         let broken = Status::unknown("h2 protocol error");
@@ -596,7 +596,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn one_that_says_nothing_does_not_hold_a_client_up() {
+    async fn a_silent_server_does_not_delay_a_client() {
         let Ok(mute) = tokio::net::TcpListener::bind("127.0.0.1:0").await else { panic!("no port") };
         let Ok(address) = mute.local_addr() else { panic!("no address") };
         let begin = std::time::Instant::now();
@@ -606,7 +606,7 @@ mod tests {
     }
 
     #[test]
-    fn certificates_that_are_refused_are_told_in_sentences() {
+    fn refused_certificates_are_reported_in_sentences() {
         let with_own = Dial {
             tls_identity: Some(("w.pem".into(), "w.key".into())),
             ..Dial::to("https://reef.example:1")

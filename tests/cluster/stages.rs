@@ -124,7 +124,7 @@ async fn losses_in_either_part_of_a_partition_change_no_byte() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn one_partition_needs_no_consensus_and_the_user_is_warned() {
+async fn one_partition_exchanges_nothing_and_the_user_is_warned() {
     let cluster = TestCluster::start().await;
     let _worker = cluster.worker(FakeTrainer::quick());
     let job = cluster.finished(&submit(&cluster, "alone", &refining(1)).await).await;
@@ -207,7 +207,7 @@ async fn one_partition_has_no_borders_and_the_user_is_warned() {
 
 /// The real trainer. Photographs are grey, so there is little to learn, but parameters change.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_real_job_has_one_water_refined_or_frozen() {
+async fn a_real_job_has_one_water_joint_or_frozen() {
     if device_for_test("a job that refines its water").is_none() {
         return;
     }

@@ -232,7 +232,7 @@ mod tests {
     }
 
     #[test]
-    fn a_way_to_a_second_small_survey_does_not_turn_the_large_one() {
+    fn a_path_to_a_small_survey_does_not_turn_the_large_one() {
         // The case where the smallest rectangle around all of them fails: 10 x 10 along the axes, and a tenth
         // far off to one side.
         let large =

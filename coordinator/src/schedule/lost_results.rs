@@ -153,7 +153,7 @@ mod tests {
     }
 
     #[test]
-    fn a_lost_result_is_made_again_and_then_merged() {
+    fn a_lost_result_is_retrained_and_then_merged() {
         let (mut bench, leases) = TwoPartitions::merging(5);
         let [_, _, second, merge] = &leases[..] else { panic!("{leases:?}") };
         let events = bench.lose(merge, &[Stage::Partition.task_of(1)]).unwrap();

@@ -342,7 +342,7 @@ mod tests {
     }
 
     #[test]
-    fn stages_compare_by_their_place_in_the_table_whatever_their_numbers() {
+    fn stages_compare_by_their_place_in_the_table() {
         let mut sorted: Vec<Stage> = Stage::all().collect();
         sorted.sort_by_key(|stage| std::cmp::Reverse(*stage as u8));
         sorted.sort_unstable();

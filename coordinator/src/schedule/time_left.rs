@@ -113,7 +113,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_is_said_before_anything_was_measured() {
+    fn there_is_no_estimate_before_the_first_measurement() {
         let job = job(1);
         assert_eq!(time_left(&job, &[task(Stage::Partition.task_of(0), 100, None)], 4), None);
         assert_eq!(time_left(&job, &[task(Stage::Partition.task_of(0), 100, Some((0, 0.0)))], 4), None);

@@ -382,7 +382,7 @@ fn a_first_part_trains_its_water_and_submits_the_evidence() {
 }
 
 #[test]
-fn a_second_part_resumes_under_the_consensus_water() {
+fn a_second_part_resumes_under_the_agreed_water() {
     let Some(executor) = executor("the second part of a partition", None) else { return };
     let two = TwoTasks::new(&executor);
     let (task, water) = two.second(Some(&two.state));

@@ -2,7 +2,7 @@
 
 use super::*;
 
-pub async fn a_paused_job_gives_nothing_out_and_takes_what_comes_in(store: Arc<dyn Store>) {
+pub async fn a_paused_job_assigns_nothing_and_accepts_results(store: Arc<dyn Store>) {
     let store = store.as_ref();
     let id = planned_job(store, 1, 3).await;
     do_next(store, Stage::Global.task(), T0 + 20).await;
@@ -146,7 +146,7 @@ pub async fn the_job_with_higher_priority_goes_first_within_limits(store: Arc<dy
     );
 }
 
-pub async fn a_list_holds_what_its_filter_admits_page_by_page(store: Arc<dyn Store>) {
+pub async fn a_list_has_all_jobs_of_its_filter_page_by_page(store: Arc<dyn Store>) {
     let store = store.as_ref();
     let mut ids = Vec::new();
     for number in 0..25 {
