@@ -21,7 +21,7 @@ ROOT = pathlib.Path(__file__).resolve().parent.parent
 SRC = "coordinator/src/"
 CONFORMANCE = "store::conformance::"
 
-SEEDS = "invariants_hold_whatever_crashes_is_cut_or_comes_twice"
+SEEDS = "invariants_hold_despite_crashes_cuts_and_repeats"
 
 # Name, file, original line, replacement, test target (of the coordinator, or PACKAGE/TARGET), test.
 MUTANTS = [

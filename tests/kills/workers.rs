@@ -247,8 +247,8 @@ fn a_job_without_workers_waits_with_a_reason_until_one_comes() {
 }
 
 #[test]
-fn everything_killed_at_once_goes_on() {
-    let scenario = "everything_killed_at_once_goes_on";
+fn a_job_survives_the_kill_of_all_processes_at_once() {
+    let scenario = "a_job_survives_the_kill_of_all_processes_at_once";
     if !can_train(scenario) {
         return;
     }

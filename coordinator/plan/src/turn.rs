@@ -175,7 +175,7 @@ mod tests {
     }
 
     #[test]
-    fn a_survey_that_lies_askew_is_laid_along_the_axes() {
+    fn a_tilted_survey_is_turned_along_the_axes() {
         for degrees in [20.0, 30.0, 42.0, -25.0, -40.0] {
             let turn = find(&turned(&survey(), degrees));
             assert_eq!(turn.rule, TurnRule::CompactCells, "{degrees}: {turn:?}");
@@ -221,7 +221,7 @@ mod tests {
     }
 
     #[test]
-    fn a_layout_with_two_directions_that_are_as_good_keeps_its_axes() {
+    fn a_layout_with_two_equal_directions_keeps_its_axes() {
         // Two paths that cross, 40 degrees apart: shares along one are compact where those along the other
         // are not.
         let arm = |degrees: f64| {

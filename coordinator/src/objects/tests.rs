@@ -75,7 +75,7 @@ async fn two_streams_do_not_write_one_blob() {
 }
 
 #[tokio::test]
-async fn a_name_that_is_no_digest_reaches_no_file() {
+async fn an_invalid_digest_reaches_no_file() {
     let (_dir, store) = open();
     for digest in ["", "..", "../../etc/passwd", &"A".repeat(64), &"../".repeat(22)[..64]] {
         let blob = BlobRef { digest: digest.to_owned(), bytes: 1 };

@@ -56,7 +56,7 @@ fn weights_move_work_between_partitions_and_add_none() {
 }
 
 #[test]
-fn budgets_are_in_proportion_to_weights_times_what_they_were() {
+fn budgets_are_proportional_to_weight_times_old_budget() {
     let (plan, _) = weighed(WeightMode::IterationBudget, Strategy::Mcmc);
     let share = |p: &Partition| f64::from(p.weighed.unweighed_iterations) * p.weight;
     let total: f64 = plan.partitions.iter().map(|p| f64::from(p.iterations)).sum();
@@ -107,7 +107,7 @@ fn one_partition_has_nothing_to_weigh() {
 }
 
 #[test]
-fn a_plan_says_when_weights_are_all_alike() {
+fn a_plan_warns_if_all_weights_are_equal() {
     let (views, points) = (survey(400), floor(4000));
     let warned = |columns: u32, clamp: f64, mode: WeightMode| {
         let mut config = config(columns, columns);

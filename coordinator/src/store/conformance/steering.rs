@@ -43,7 +43,7 @@ pub async fn a_paused_job_assigns_nothing_and_accepts_results(store: Arc<dyn Sto
     }
 }
 
-pub async fn the_time_of_a_stage_is_without_pauses(store: Arc<dyn Store>) {
+pub async fn the_duration_of_a_stage_excludes_pauses(store: Arc<dyn Store>) {
     let store = store.as_ref();
     let steer = async |id: &JobId, event, now_ms| store.steer(id, event, now_ms).await.unwrap().job;
     let pause = || Event::Pause { reason: String::new() };
@@ -62,7 +62,7 @@ pub async fn the_time_of_a_stage_is_without_pauses(store: Arc<dyn Store>) {
     assert_eq!(store.job_row(&id).await.unwrap().stage_seconds[&Stage::Merge], 3.0);
 }
 
-pub async fn a_failed_job_goes_on_where_it_failed(store: Arc<dyn Store>) {
+pub async fn a_retried_job_resumes_where_it_failed(store: Arc<dyn Store>) {
     let store = store.as_ref();
     let id = planned_job(store, 1, 2).await;
     do_next(store, Stage::Global.task(), T0 + 20).await;
