@@ -288,7 +288,7 @@ impl Harness {
         let data = self.data.to_string_lossy().into_owned();
         let found = output_of(&["store", "verify", "--data-dir", &data, "--deep", "--json"]);
         let said = String::from_utf8_lossy(&found.stdout).into_owned();
-        assert!(found.status.success(), "what the coordinator left is damaged: {said}");
+        assert!(found.status.success(), "the coordinator left damaged data: {said}");
     }
 
     /// Jobs deleted by their user need not be known.

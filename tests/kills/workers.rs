@@ -1,4 +1,4 @@
-//! Workers that are killed in each phase of a task, that leave, or that return as zombies.
+//! Workers that are killed at each step of a task, that leave, or that return as zombies.
 
 use std::path::Path;
 use std::time::{Duration, Instant};

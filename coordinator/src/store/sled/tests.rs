@@ -14,12 +14,12 @@ fn blob() -> BlobRef {
     BlobRef { digest: "0".repeat(64), bytes: 1 }
 }
 
-async fn claim(store: &SledStore, kind: Stage, request_id: &str) -> Option<Lease> {
+async fn claim(store: &SledStore, stage: Stage, request_id: &str) -> Option<Lease> {
     let (name, incarnation) = ("worker".into(), "incarnation".into());
     let worker = WorkerProfile {
         name,
         incarnation,
-        stages: vec![kind],
+        stages: vec![stage],
         methods: fathom_core::config::Method::ALL.to_vec(),
         memory_bytes: None,
         tenant: None,
