@@ -273,12 +273,12 @@ impl Harness {
     /// As [`Harness::succeeded`]; then kills the coordinator a last time and checks its data directory.
     pub fn conclude(mut self, job: &Job) -> History {
         let history = self.succeeded(job);
-        self.look_at_what_is_left();
+        self.check_data_dir();
         history
     }
 
     /// Every acknowledged job is known, and all its blobs are intact.
-    pub fn look_at_what_is_left(&mut self) {
+    pub fn check_data_dir(&mut self) {
         for job in &self.jobs {
             self.show(job);
         }

@@ -37,7 +37,7 @@ pub fn time_left(
 /// Iterations of a task that are already done.
 fn iteration(task: &TaskRecord, live: Option<&LiveProgress>) -> u32 {
     let checkpoint = task.checkpoint.as_ref().map_or(0, |checkpoint| checkpoint.iteration);
-    // The iterations of a first part and its second part count on: those before a task are not its own.
+    // Both count from the beginning of the task, also in the second part of a partition.
     live.map_or(0, |live| live.iteration).max(checkpoint)
 }
 
