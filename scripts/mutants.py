@@ -21,7 +21,7 @@ ROOT = pathlib.Path(__file__).resolve().parent.parent
 SRC = "coordinator/src/"
 CONFORMANCE = "store::conformance::"
 
-SEEDS = "invariants_hold_whatever_crashes_is_cut_or_comes_twice"
+SEEDS = "invariants_hold_despite_crashes_cuts_and_repeats"
 
 # Name, file, original line, replacement, test target (of the coordinator, or PACKAGE/TARGET), test.
 MUTANTS = [
@@ -143,7 +143,7 @@ MUTANTS = [
         "candidates.retain(|(_, job)| !is_at_its_limit(&job.tenant));",
         "let _ = is_at_its_limit;",
         "lib",
-        CONFORMANCE + "sled::a_tenant_gets_no_more_than_it_may_have",
+        CONFORMANCE + "sled::a_tenant_stays_within_its_quota",
     ),
     (
         "a second worker keeps its lease when the task ends",
@@ -167,7 +167,7 @@ MUTANTS = [
         "stored.is_ok_and(|stored| stored == token.digest()) && self.id == token.id",
         "stored.is_ok() && self.id == token.id",
         "lib",
-        "access::table::tests::only_a_token_that_holds_opens_the_door",
+        "access::table::tests::only_a_valid_token_is_admitted",
     ),
     (
         "tenants see each other",
@@ -183,7 +183,7 @@ MUTANTS = [
         "if !may(&caller, service, method) {",
         "if !may(&caller, service, method) && caller.name.is_empty() {",
         "cluster",
-        "access::a_role_does_what_it_is_for_and_nothing_else",
+        "access::a_role_permits_its_own_calls_and_no_others",
     ),
     (
         "revoked tokens end nothing that lasts",
@@ -255,7 +255,7 @@ MUTANTS = [
         "let options = SledOptions { dir: copy.path().to_owned(), ..options.clone() };",
         "let options = options.clone();",
         "lib",
-        "store::sled::tests::who_only_looks_opens_a_copy_and_changes_no_byte",
+        "store::sled::tests::read_only_access_opens_a_copy_and_changes_no_byte",
     ),
     (
         "files from the future are for ever",

@@ -20,18 +20,18 @@ from pathlib import Path
 
 WIDTH = 110
 ROOT = Path(__file__).resolve().parent.parent
-# What Markdown would take for a mark of its own at the start of a line.
+# Words that Markdown would read as markup at the start of a line.
 MARK = re.compile(r"[-+*>=]+$|#+$|\d+[.)]$|\||```|~~~|:{1,2}$")
 ITEM = re.compile(r"(\s*)([-*+]|\d+[.)])(\s+)(?=\S)")
 DRAWN = re.compile("[\u2500-\u257f\u25ba]")
-# Lines of their own: tables, headings, HTML, definitions of links, directives; and settings in files of
-# settings.
+# Lines that are never joined: tables, headings, HTML, link definitions, directives, and settings in settings
+# files.
 FIXED = re.compile(r"\s*(\||#{1,6}\s|<|\[[^\]]+\]:\s|shellcheck |!|---|===|@)")
 SETTING = re.compile(r"\s*([\w.-]+ = |\[[\w.-]+\]$)")
 
 
 def words_of(text):
-    """Words, where a code span of up to 60 characters counts as one, and a mark of Markdown sticks to what is before it."""
+    """Words. A code span of up to 60 characters counts as one, and markup stays with the word before it."""
     spans = lambda m: m[0].replace(" ", "\0") if len(m[0]) <= 60 else m[0]
     words = []
     for word in re.sub(r"(?<!`)`[^`]+`(?!`)", spans, text).split():
@@ -43,7 +43,7 @@ def words_of(text):
 
 
 def fill(words, first, rest):
-    """Lines of at most WIDTH columns: `first` before the first one, `rest` before the others."""
+    """Lines of at most WIDTH columns: the first begins with `first`, the others with `rest`."""
     lines, line = [], first
     empty = True
     for word in words:
@@ -56,7 +56,7 @@ def fill(words, first, rest):
 
 
 def wrap(lines, lead):
-    """Wraps the paragraphs of a block of prose; `lead` stands before every line (indentation and comment marker)."""
+    """Wraps the paragraphs of a block of prose; every line begins with `lead` (indentation and comment marker)."""
     out, paragraph, fenced = [], [], False
 
     def flush():
@@ -91,7 +91,7 @@ def wrap(lines, lead):
         elif inside and indent >= len(ITEM.match(paragraph[0])[0]):
             paragraph.append(text)
         elif indent > 1:
-            # Formulas, columns, and text below an item that is no part of its first paragraph.
+            # Formulas, columns, and text below an item but outside its first paragraph.
             flush()
             column = column_of(text) if lead.strip() and len(lead + text) > WIDTH else None
             out.extend([lead + text] if column is None else
@@ -105,18 +105,18 @@ def wrap(lines, lead):
 
 
 def column_of(text):
-    """Where the last column of an indented line begins; None where there is none, in formulas and in diagrams."""
+    """The start of the last column of an indented line; None without columns, in formulas and in diagrams."""
     gaps = [m.end() for m in re.finditer(r"(?:(?<=\S) {2,}|^ {12,})(?=\S)", text[:60])]
     return gaps[-1] if gaps and not re.search(r" = |exp\(", text) and not DRAWN.search(text) else None
 
 
 def ends_here(lead, line, following):
-    """Whether a line was broken on purpose: a sentence ends where the next word would have had much room."""
+    """Whether a line was broken on purpose: a sentence ends, and the next word would have fitted easily."""
     return line.endswith((".", ":", ";")) and len(lead + line) + 1 + len(following.split()[0]) <= WIDTH - 25
 
 
 def rust_starts(text):
-    """For each line of Rust: whether it begins in code, and not in a string or a block comment."""
+    """For each line of Rust: whether it begins in code, not in a string or a block comment."""
     starts, i, depth = [True], 0, 0
     while i < len(text):
         if depth:
@@ -145,7 +145,7 @@ def rust_starts(text):
 
 
 def hash_starts(path, text):
-    """For each line of Python, shell or TOML: whether a `#` there begins a comment that has the line for itself."""
+    """For each line of Python, shell or TOML: whether a `#` there begins a comment that fills the line."""
     lines = text.split("\n")
     if path.suffix == ".py":
         comments = {token.start[0] for token in tokenize.generate_tokens(io.StringIO(text).readline)
@@ -170,7 +170,7 @@ def hash_starts(path, text):
 
 
 def comment_of(path, line):
-    """Lead and text of a line that is a comment and nothing else; None for every other line."""
+    """Lead and text of a line that is only a comment; None for every other line."""
     if path.suffix in (".rs", ".wgsl", ".proto"):
         m = re.match(r"(\s*)(//[/!]?)(?!/)(.*)$", line)
     else:
@@ -212,7 +212,7 @@ def rewrapped(path, text):
 
 
 def essence(path, text):
-    """What must stay: the code line by line, and all words of the comments between two lines of code."""
+    """The parts that must stay: the code line by line, and all words of the comments between two lines of code."""
     parts = [""]
     for line in text.split("\n"):
         found = ("", line) if path.suffix == ".md" else comment_of(path, line)
@@ -279,7 +279,7 @@ def self_check():
         assert rewrapped(path, new) == new, f"{text}\nis wrapped again"
         assert essence(path, new) == essence(path, text), text
     assert essence(Path("a.rs"), "// a b\nc\n") != essence(Path("a.rs"), "// a\nc // b\n")
-    print(f"rewrap: {len(cases)} made-up files are wrapped as they should be")
+    print(f"rewrap: {len(cases)} test files are wrapped correctly")
 
 
 def tracked():

@@ -247,7 +247,7 @@ mod tests {
     }
 
     #[test]
-    fn a_preset_is_what_other_settings_stand_on() {
+    fn other_settings_build_on_the_preset() {
         use fathom_core::config::{Medium, Preset};
         let of = |preset: &str, set: &[&str]| {
             let set = set.iter().map(|setting| (*setting).to_owned()).collect();
@@ -286,7 +286,7 @@ mod tests {
             of("preset = \"paper\"\n[water]\nlr = 0.02\n", "paper").expect("its preset").water.lr,
             0.02
         );
-        let bare = of("[train]\nseed = 7\n", "3dgs").expect("nothing of the water");
+        let bare = of("[train]\nseed = 7\n", "3dgs").expect("no water settings");
         assert_eq!(bare.water, JobConfig::of_preset(fathom_core::config::Preset::Splatting).water);
     }
 

@@ -215,7 +215,7 @@ mod tests {
     }
 
     #[test]
-    fn rules_follow_each_other_and_say_so() {
+    fn rules_are_combined_and_all_named() {
         let grey = [0.3, 0.5, 0.4];
         assert!(found(&args("none", &[]), grey).expect("nothing").is_none());
         let auto = found(&args("auto", &[]), grey).expect("gains").expect("gains");

@@ -136,11 +136,11 @@ async fn plan(store: &SledStore, partitions: usize) -> Result<JobId, Failure> {
     Ok(id)
 }
 
-async fn take(store: &SledStore, kind: Stage, request_id: String) -> Result<Option<Lease>, Failure> {
+async fn take(store: &SledStore, stage: Stage, request_id: String) -> Result<Option<Lease>, Failure> {
     let worker = WorkerProfile {
         name: "bench".into(),
         incarnation: "bench".into(),
-        stages: vec![kind],
+        stages: vec![stage],
         methods: fathom_core::config::Method::ALL.to_vec(),
         memory_bytes: None,
         tenant: None,

@@ -229,7 +229,7 @@ mod tests {
     }
 
     #[test]
-    fn contradictions_are_told_together() {
+    fn contradictions_are_reported_together() {
         let said = faults(|config| {
             config.tls_cert = Some("a.pem".into());
             config.client_ca = Some("b.pem".into());

@@ -2,8 +2,8 @@
 //!
 //! The path of a call: [`access`] authenticates and authorises it, `services` decode it, the [`store`]
 //! applies the rules of [`schedule`] in one durable transaction, and the reply is encoded. The coordinator's
-//! own work (plan, exchange, merge, artifacts) runs as tasks with leases like all
-//! others; `own_tasks` takes them. Bytes are in [`objects`], log lines in `logs`; `metrics` counts.
+//! own work (plan, exchange, merge, artifacts) runs as tasks with leases like all others; `own_tasks` takes
+//! them. Bytes are in [`objects`], log lines in `logs`, counters in `metrics`.
 
 pub mod access;
 mod capacity;

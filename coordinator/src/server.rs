@@ -112,7 +112,7 @@ impl Coordinator {
     pub async fn stop(self) -> Result<(), CoordinatorError> {
         self.stopping.send_replace(true);
         let Self { mut running, shared, .. } = self;
-        // Its part of the store is closed with that of the server.
+        // The store closes when the server drops its own reference, too.
         drop(shared);
         match tokio::time::timeout(STOP_WITHIN, &mut running).await {
             Ok(result) => flatten(result),

@@ -20,7 +20,7 @@ pub enum ServiceError {
     /// An invalid field.
     #[error("{field}: {message}")]
     BadArgument {
-        /// Its name or id.
+        /// Its name.
         field: &'static str,
         /// The fault, and a remedy.
         message: String,
@@ -64,7 +64,7 @@ pub enum ServiceError {
     /// A call that references a missing blob.
     #[error("blob {digest} has not been uploaded; upload it and call again")]
     BlobMissing {
-        /// Its name or id.
+        /// Its digest.
         digest: String,
     },
     /// A caller without a valid token.
@@ -105,7 +105,7 @@ pub enum ServiceError {
         "{tenant} uses {used_bytes} of {limit_bytes} bytes; delete jobs that are not needed, or ask an operator for more"
     )]
     TooManyBytes {
-        /// Its name or id.
+        /// The tenant.
         tenant: Tenant,
         /// Bytes used.
         used_bytes: u64,

@@ -229,7 +229,7 @@ mod tests {
     }
 
     #[test]
-    fn a_change_counts_once_when_two_looks_in_a_row_have_found_it() {
+    fn a_change_counts_once_two_checks_in_a_row_found_it() {
         let mut changes = Changes { judged: pems("a"), seen: pems("a") };
         let broken = || Err("it cannot be read".to_owned());
         let mut found = |found: Result<Pems, String>| changes.found(found.clone()) == Some(found);

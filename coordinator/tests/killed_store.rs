@@ -34,13 +34,13 @@ const DIR: &str = "FATHOM_TEST_KILLED_STORE";
 const ROUND: &str = "FATHOM_TEST_KILLED_STORE_ROUND";
 
 #[test]
-fn what_was_acknowledged_survives_sigkill() {
+fn acknowledged_changes_survive_sigkill() {
     kill_again_and_again(6);
 }
 
 #[test]
 #[ignore = "takes minutes"]
-fn what_was_acknowledged_survives_hundreds_of_sigkills() {
+fn acknowledged_changes_survive_hundreds_of_sigkills() {
     kill_again_and_again(300);
 }
 
@@ -143,8 +143,8 @@ async fn finish_all_jobs(store: &SledStore, known: &Acknowledged, round: u64) {
     }
     known.check(store, u32::MAX).await;
     let jobs = store.list(&JobFilter::default(), None, 100_000).await.unwrap();
-    let refined = jobs.iter().filter(|job| job.output(Artifact::Exchange).is_some()).count();
+    let exchanged = jobs.iter().filter(|job| job.output(Artifact::Exchange).is_some()).count();
     let bordered = jobs.iter().filter(|job| job.shape.stages.contains(&Stage::Borders)).count();
-    assert!(bordered > 0 && bordered < jobs.len(), "{bordered} of {} jobs refined their borders", jobs.len());
-    assert!(refined > 0 && refined < jobs.len(), "{refined} of {} jobs refined their water", jobs.len());
+    assert!(bordered > 0 && bordered < jobs.len(), "{bordered} of {} jobs trained their borders", jobs.len());
+    assert!(exchanged > 0 && exchanged < jobs.len(), "{exchanged} of {} jobs had an exchange", jobs.len());
 }

@@ -128,7 +128,7 @@ impl<K: Send + Sync + 'static> Source<K> {
     }
 
     /// Reports how many lines were dropped, if any.
-    fn confess(&self, waiting: &mut Waiting<K>, count: &mut Count) {
+    fn report_dropped(&self, waiting: &mut Waiting<K>, count: &mut Count) {
         let dropped = std::mem::take(&mut count.dropped);
         if dropped > 0 {
             let message = format!("dropped {dropped} lines here: they came faster than they could be stored");
@@ -145,7 +145,7 @@ impl<K: Send + Sync + 'static> Sink for Source<K> {
             count.dropped += 1;
             return;
         }
-        self.confess(&mut waiting, &mut count);
+        self.report_dropped(&mut waiting, &mut count);
         self.push(&mut waiting, &mut count, line);
         drop(waiting);
         self.queue.changed.notify_waiters();
@@ -157,7 +157,7 @@ impl<K: Send + Sync + 'static> Drop for Source<K> {
         let mut waiting = self.queue.lock();
         let mut count = self.count.lock().unwrap_or_else(PoisonError::into_inner);
         // One line beyond the bound for each attempt that dropped lines.
-        self.confess(&mut waiting, &mut count);
+        self.report_dropped(&mut waiting, &mut count);
         drop(waiting);
         self.queue.changed.notify_waiters();
     }

@@ -144,7 +144,7 @@ impl Secret {
     /// When it cannot be read or is empty.
     pub fn read(path: &Path) -> Result<Self, DialError> {
         let wrong = |message: String| DialError::File { path: path.to_owned(), message };
-        let text = std::fs::read_to_string(path).map_err(|error| wrong(said_of_file(&error)))?;
+        let text = std::fs::read_to_string(path).map_err(|error| wrong(message_of_file(&error)))?;
         if text.trim().is_empty() {
             return Err(wrong("it is empty; it should contain a token".to_owned()));
         }
@@ -227,7 +227,7 @@ impl Dial {
             Ok(channel) => Ok(InterceptedService::new(channel, credentials)),
             Err(error) => {
                 let said = root_cause(&error);
-                Err(match self.not_spoken().await.or_else(|| self.fault_of_tls(&said)) {
+                Err(match self.other_protocol().await.or_else(|| self.fault_of_tls(&said)) {
                     Some(error) => error,
                     None => DialError::Connect(said),
                 })
@@ -244,7 +244,7 @@ impl Dial {
         }
         match self.fault_of_tls(&cause(status)) {
             Some(error) => Some(error),
-            None if self.url.starts_with("http://") => self.not_spoken().await,
+            None if self.url.starts_with("http://") => self.other_protocol().await,
             None if self.tls_identity.is_some() => self.not_trusted().await,
             None => None,
         }
@@ -282,7 +282,7 @@ impl Dial {
 
     /// Probes which protocol an `http://` address speaks. Only positive evidence counts: a silent server may
     /// be a coordinator.
-    async fn not_spoken(&self) -> Option<DialError> {
+    async fn other_protocol(&self) -> Option<DialError> {
         let rest = self.url.strip_prefix("http://")?;
         let host = rest.split(['/', '?']).next().unwrap_or_default();
         let has_port = host.rsplit_once(':').is_some_and(|(_, port)| port.parse::<u16>().is_ok());
@@ -399,7 +399,7 @@ impl Dial {
     fn tls(&self) -> Result<ClientTlsConfig, DialError> {
         let read = |path: &Path| {
             let wrong = |message: String| DialError::File { path: path.to_owned(), message };
-            let text = std::fs::read_to_string(path).map_err(|error| wrong(said_of_file(&error)))?;
+            let text = std::fs::read_to_string(path).map_err(|error| wrong(message_of_file(&error)))?;
             if text.contains("-----BEGIN ") {
                 Ok(text)
             } else {
@@ -463,7 +463,7 @@ async fn answer_to(address: &str, begin: &[u8]) -> std::io::Result<Vec<u8>> {
 }
 
 /// The system's error text for a file, without its number.
-fn said_of_file(error: &std::io::Error) -> String {
+fn message_of_file(error: &std::io::Error) -> String {
     match error.kind() {
         std::io::ErrorKind::NotFound => "no such file".to_owned(),
         std::io::ErrorKind::PermissionDenied => "this user may not read it".to_owned(),
@@ -543,7 +543,7 @@ mod tests {
 
     /// An address that answers each connection that begins with `begin` with `answer`, and closes every
     /// connection.
-    async fn that_answers(begin: &'static [u8], answer: &'static [u8]) -> String {
+    async fn server_answering(begin: &'static [u8], answer: &'static [u8]) -> String {
         let Ok(listener) = tokio::net::TcpListener::bind("127.0.0.1:0").await else { panic!("no port") };
         let Ok(address) = listener.local_addr() else { panic!("no address") };
         tokio::spawn(async move {
@@ -560,7 +560,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn what_is_no_coordinator_is_told_from_one_that_is_away() {
+    async fn other_servers_differ_from_an_absent_coordinator() {
         let alert: &[u8] = &[0x15, 3, 3, 0, 2, 2, 10];
         let settings: &[u8] = &[0, 0, 0, 4, 0, 0, 0, 0, 0];
         let broken = Status::unknown("h2 protocol error");
@@ -580,7 +580,7 @@ mod tests {
             (b"PRI ", settings, None),
             (b"nobody", b"", None),
         ] {
-            let dial = Dial::to(&that_answers(begin, answer).await);
+            let dial = Dial::to(&server_answering(begin, answer).await);
             let error = dial.misdialled(&broken).await.map(|error| error.to_string());
             match says {
                 Some(words) => {
@@ -596,7 +596,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn one_that_says_nothing_does_not_hold_a_client_up() {
+    async fn a_silent_server_does_not_delay_a_client() {
         let Ok(mute) = tokio::net::TcpListener::bind("127.0.0.1:0").await else { panic!("no port") };
         let Ok(address) = mute.local_addr() else { panic!("no address") };
         let begin = std::time::Instant::now();
@@ -606,7 +606,7 @@ mod tests {
     }
 
     #[test]
-    fn certificates_that_are_refused_are_told_in_sentences() {
+    fn refused_certificates_are_reported_in_sentences() {
         let with_own = Dial {
             tls_identity: Some(("w.pem".into(), "w.key".into())),
             ..Dial::to("https://reef.example:1")

@@ -141,7 +141,7 @@ async fn only_its_tenant_uses_a_dataset_and_viewers_read_it() {
 }
 
 #[tokio::test]
-async fn a_role_does_what_it_is_for_and_nothing_else() {
+async fn a_role_permits_its_own_calls_and_no_others() {
     let cluster = GuardedCluster::start(|_, _| {}).await;
     let submitter = cluster.caller(Role::Submitter, "reef").await;
     let viewer = cluster.caller(Role::Viewer, "reef").await;

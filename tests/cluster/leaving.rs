@@ -12,7 +12,7 @@ use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::watch;
 
 /// A proxy to the coordinator that delays its answers while `held`.
-async fn way_with_a_gate(to: SocketAddr, held: watch::Receiver<bool>) -> String {
+async fn gated_proxy(to: SocketAddr, held: watch::Receiver<bool>) -> String {
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let url = format!("http://{}", listener.local_addr().unwrap());
     tokio::spawn(async move {
@@ -57,7 +57,7 @@ async fn a_leaving_worker_submits_its_checkpoint_and_counts_no_loss() {
 async fn a_leaving_worker_returns_a_task_still_being_assigned() {
     let cluster = TestCluster::start().await;
     let (held, holds) = watch::channel(false);
-    let url = way_with_a_gate(cluster.address(), holds).await;
+    let url = gated_proxy(cluster.address(), holds).await;
     let trainer = FakeTrainer::hangs_after_checkpoint();
     let worker = cluster.worker_at(&url, Arc::clone(&trainer));
     while cluster.workers().await.is_empty() {
@@ -83,7 +83,7 @@ async fn a_leaving_worker_returns_a_task_still_being_assigned() {
 async fn a_worker_with_a_result_leaves_even_without_a_coordinator() {
     let cluster = TestCluster::start().await;
     let (held, holds) = watch::channel(false);
-    let url = way_with_a_gate(cluster.address(), holds).await;
+    let url = gated_proxy(cluster.address(), holds).await;
     let trainer = FakeTrainer::slow();
     let worker = cluster.worker_at(&url, Arc::clone(&trainer));
     let job = cluster.submit("not submitted", 1).await;

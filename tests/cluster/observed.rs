@@ -142,7 +142,7 @@ async fn metrics_count_the_work_of_a_whole_run() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn faults_are_counted_by_kind_and_callers_make_no_series() {
+async fn faults_are_counted_by_class_and_callers_add_no_series() {
     let cluster = TestCluster::start().await;
     let job = cluster.submit("faults", 1).await;
     let worker = cluster.worker(FakeTrainer::hangs_after_checkpoint());

@@ -16,7 +16,7 @@ use fathom_worker::execute::CoreExecutor;
 use prost::Message;
 use serde_json::Value;
 
-/// A small job whose partitions refine the water if there are several.
+/// A small job whose partitions train the water jointly if there are several.
 fn refining(columns: u32) -> JobConfig {
     let mut config = JobConfig::default();
     config.data.test_every = 5;
@@ -94,27 +94,27 @@ async fn losses_in_either_part_of_a_partition_change_no_byte() {
     worker.leave().await;
 
     let disturbed = submit(&cluster, "disturbed", &refining(2)).await;
-    let is_checkpointed = |job: &v1::Job, kind: v1::Stage| {
-        job.tasks.iter().any(|task| task.stage() == kind && task.checkpoint_iteration > 0)
+    let is_checkpointed = |job: &v1::Job, stage: v1::Stage| {
+        job.tasks.iter().any(|task| task.stage() == stage && task.checkpoint_iteration > 0)
     };
-    for kind in [FirstPart, Partition] {
-        let victim = cluster.worker(FakeTrainer::hangs_in(kind));
-        let hangs = cluster.wait_for(&disturbed, |job| is_checkpointed(job, kind)).await;
-        assert_eq!(hangs.stage(), kind);
+    for stage in [FirstPart, Partition] {
+        let victim = cluster.worker(FakeTrainer::hangs_in(stage));
+        let hangs = cluster.wait_for(&disturbed, |job| is_checkpointed(job, stage)).await;
+        assert_eq!(hangs.stage(), stage);
         cluster.restart().await;
         victim.kill();
     }
     let _successor = cluster.worker(FakeTrainer::quick());
     let job = cluster.finished(&disturbed).await;
     assert_eq!(job.state(), v1::JobState::Succeeded, "{}", job.error);
-    for kind in [FirstPart, Partition] {
+    for stage in [FirstPart, Partition] {
         let lost: Vec<&v1::Task> =
-            job.tasks.iter().filter(|task| task.stage() == kind && task.losses > 0).collect();
+            job.tasks.iter().filter(|task| task.stage() == stage && task.losses > 0).collect();
         assert!(
             matches!(lost[..], [task] if task.resumed_from_iteration > 0),
-            "{kind:?} started over: {lost:?}"
+            "{stage:?} started over: {lost:?}"
         );
-        let others = job.tasks.iter().filter(|task| task.stage() == kind && task.losses == 0);
+        let others = job.tasks.iter().filter(|task| task.stage() == stage && task.losses == 0);
         assert!(others.into_iter().all(|task| task.attempts == 1), "a task was trained twice without need");
     }
     let files = [cluster.artifacts(&undisturbed).await, cluster.artifacts(&disturbed).await];
@@ -124,7 +124,7 @@ async fn losses_in_either_part_of_a_partition_change_no_byte() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn one_partition_needs_no_consensus_and_the_user_is_warned() {
+async fn one_partition_exchanges_nothing_and_the_user_is_warned() {
     let cluster = TestCluster::start().await;
     let _worker = cluster.worker(FakeTrainer::quick());
     let job = cluster.finished(&submit(&cluster, "alone", &refining(1)).await).await;
@@ -207,8 +207,8 @@ async fn one_partition_has_no_borders_and_the_user_is_warned() {
 
 /// The real trainer. Photographs are grey, so there is little to learn, but parameters change.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_real_job_has_one_water_refined_or_frozen() {
-    if device_for_test("a job that refines its water").is_none() {
+async fn a_real_job_has_one_water_joint_or_frozen() {
+    if device_for_test("a job with a joint water").is_none() {
         return;
     }
     let executor =

@@ -202,7 +202,7 @@ fn doctor_lists_adapters_or_says_which_package_is_missing() {
 }
 
 #[test]
-fn the_help_of_every_verb_can_be_read() {
+fn the_help_of_every_verb_is_printed() {
     for verb in [
         "train",
         "coordinator",

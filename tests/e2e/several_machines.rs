@@ -172,8 +172,8 @@ fn is_there(program: &str, test: &str) -> bool {
 }
 
 #[test]
-fn the_guide_to_several_machines_works_as_it_stands() {
-    let test = "the_guide_to_several_machines_works_as_it_stands";
+fn the_guide_to_several_machines_works_verbatim() {
+    let test = "the_guide_to_several_machines_works_verbatim";
     if !is_there("openssl", test) || !can_train(test) {
         return;
     }

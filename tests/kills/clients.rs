@@ -65,7 +65,7 @@ fn an_upload_of_a_killed_client_is_resumed() {
     let job = harness.watch(job);
     job.wait_for("a plan", |event| event["task"] == "plan" && event["state"] == "done");
     assert_eq!(harness.partial_uploads().len(), 0, "a partial upload remains");
-    harness.look_at_what_is_left();
+    harness.check_data_dir();
 }
 
 #[test]
@@ -128,7 +128,7 @@ fn a_job_cancelled_during_its_merge_stays_cancelled() {
     harness.succeeded(&next);
     drop(readers);
     assert_eq!(harness.show(&job.id)["state"], "cancelled");
-    harness.look_at_what_is_left();
+    harness.check_data_dir();
 }
 
 #[test]

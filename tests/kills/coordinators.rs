@@ -121,7 +121,7 @@ fn a_stalled_coordinator_takes_no_task_from_live_workers() {
     harness.start_worker("first");
     let job = harness.submit();
     job.wait_for_checkpoint("partition-0000");
-    harness.coordinator().stand_still();
+    harness.coordinator().suspend();
     std::thread::sleep(Duration::from_millis(3 * harness.rules.lease_ms));
     harness.coordinator().go_on();
     let history = harness.conclude(&job);

@@ -273,12 +273,12 @@ impl Harness {
     /// As [`Harness::succeeded`]; then kills the coordinator a last time and checks its data directory.
     pub fn conclude(mut self, job: &Job) -> History {
         let history = self.succeeded(job);
-        self.look_at_what_is_left();
+        self.check_data_dir();
         history
     }
 
     /// Every acknowledged job is known, and all its blobs are intact.
-    pub fn look_at_what_is_left(&mut self) {
+    pub fn check_data_dir(&mut self) {
         for job in &self.jobs {
             self.show(job);
         }
@@ -288,7 +288,7 @@ impl Harness {
         let data = self.data.to_string_lossy().into_owned();
         let found = output_of(&["store", "verify", "--data-dir", &data, "--deep", "--json"]);
         let said = String::from_utf8_lossy(&found.stdout).into_owned();
-        assert!(found.status.success(), "what the coordinator left is damaged: {said}");
+        assert!(found.status.success(), "the coordinator left damaged data: {said}");
     }
 
     /// Jobs deleted by their user need not be known.

@@ -254,7 +254,7 @@ impl fmt::Display for History {
 }
 
 impl Acknowledged {
-    /// All of a worker's log.
+    /// All acknowledgements in a worker's log.
     pub fn in_log(log: &str) -> Vec<Self> {
         log.lines().filter_map(Self::in_line).collect()
     }

@@ -70,7 +70,7 @@ impl Process {
     }
 
     /// SIGSTOP: the process stops without notice.
-    pub fn stand_still(&self) {
+    pub fn suspend(&self) {
         self.signal("STOP");
     }
 

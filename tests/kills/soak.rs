@@ -96,7 +96,7 @@ fn kill_at_random(scenario: &'static str, rounds: u32) {
         }
     }
     let kills = chaos.kills();
-    chaos.harness.look_at_what_is_left();
+    chaos.harness.check_data_dir();
     println!("{rounds} jobs in {:.0?}, {kills} kills survived; {}", begin.elapsed(), chaos.figures.said());
 }
 
@@ -125,14 +125,14 @@ impl Chaos {
             4..7 => self.kill_worker(),
             7 => {
                 let Some(name) = self.any_worker() else { return };
-                self.harness.worker(&name).stand_still();
+                self.harness.worker(&name).suspend();
                 self.harness.random.sleep(lease / 4, 3 * lease);
                 self.harness.worker(&name).go_on();
                 self.figures.stopped += 1;
             }
             8 => {
                 self.disturbed.push(Instant::now());
-                self.harness.coordinator().stand_still();
+                self.harness.coordinator().suspend();
                 self.harness.random.sleep(lease / 4, 3 * lease);
                 self.harness.coordinator().go_on();
                 self.disturbed.push(Instant::now());

@@ -1,4 +1,4 @@
-//! Workers that are killed in each phase of a task, that leave, or that return as zombies.
+//! Workers that are killed at each step of a task, that leave, or that return as zombies.
 
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -170,7 +170,7 @@ fn a_worker_that_wakes_after_its_lease_changes_nothing() {
     let before = link.sent();
     // It stops in the middle of submitting its result.
     wait_for("a part of a result", || (link.sent() > before + 60_000).then_some(()));
-    harness.worker("zombie").stand_still();
+    harness.worker("zombie").suspend();
     harness.start_worker("successor");
     let (_, taken) = job.wait_after(0, "the successor", |event| {
         event["task"] == "partition-0000" && event["worker"] == "successor" && event["state"] == "running"
@@ -189,7 +189,7 @@ fn a_worker_that_wakes_after_its_lease_changes_nothing() {
             || said.contains("the result is no longer needed"))
         .then_some(())
     });
-    harness.look_at_what_is_left();
+    harness.check_data_dir();
 }
 
 #[test]
@@ -247,8 +247,8 @@ fn a_job_without_workers_waits_with_a_reason_until_one_comes() {
 }
 
 #[test]
-fn everything_killed_at_once_goes_on() {
-    let scenario = "everything_killed_at_once_goes_on";
+fn a_job_survives_the_kill_of_all_processes_at_once() {
+    let scenario = "a_job_survives_the_kill_of_all_processes_at_once";
     if !can_train(scenario) {
         return;
     }

@@ -30,7 +30,7 @@ pub struct FakeTrainer {
     pause: Duration,
     /// Pause between two checks for a stop while it hangs after its first checkpoint.
     hangs: Option<Duration>,
-    /// The only kind of task in which it hangs.
+    /// The only stage in whose tasks it hangs.
     hangs_only_in: Option<v1::Stage>,
     failures_left: AtomicU32,
     /// Number of `prepare` calls that still fail.
@@ -78,9 +78,9 @@ impl FakeTrainer {
         Self::new(0, Some(10), 0)
     }
 
-    /// The same, but only in tasks of one kind.
-    pub fn hangs_in(kind: v1::Stage) -> Arc<Self> {
-        Arc::new(Self { hangs_only_in: Some(kind), ..Self::with(0, Some(10), 0) })
+    /// The same, but only in tasks of one stage.
+    pub fn hangs_in(stage: v1::Stage) -> Arc<Self> {
+        Arc::new(Self { hangs_only_in: Some(stage), ..Self::with(0, Some(10), 0) })
     }
 
     /// The same, but it checks for a stop only twice a second, like training.
@@ -295,7 +295,7 @@ fn with_other_rows_in_the_band(task: &TaskInput, state: &[u8; 32]) -> Result<Byt
     Ok(model.into())
 }
 
-/// The header of a model: it has a water only if partitions refine it, because the fake has none.
+/// The header of a model: it has a water only if partitions train one, because the fake has none.
 fn comments(task: &TaskInput) -> Vec<String> {
     let water = match (task.input(Artifact::Exchange), task.config.water.partitions) {
         (Some(path), _) => {

@@ -35,7 +35,7 @@ pub enum Stop {
 
 /// Data that the heartbeat sends, and the answers that it received.
 #[derive(Default)]
-struct Beating {
+struct PulseState {
     lease: Option<v1::Lease>,
     progress: Option<Progress>,
     stop: Option<Stop>,
@@ -45,7 +45,7 @@ struct Beating {
 /// State shared between the session, the training thread and the heartbeat.
 #[derive(Default)]
 pub struct Pulse {
-    state: Mutex<Beating>,
+    state: Mutex<PulseState>,
     /// Notified when the work must stop.
     stopped: Notify,
     /// Notified when there is a lease to renew.
@@ -53,7 +53,7 @@ pub struct Pulse {
 }
 
 impl Pulse {
-    fn lock(&self) -> MutexGuard<'_, Beating> {
+    fn lock(&self) -> MutexGuard<'_, PulseState> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
@@ -129,7 +129,7 @@ impl Pulse {
     }
 
     /// Acts on the coordinator's answers about leases.
-    fn heed(&self, outcomes: Vec<v1::RenewOutcome>) {
+    fn apply(&self, outcomes: Vec<v1::RenewOutcome>) {
         for outcome in outcomes {
             let Some(lease) = &outcome.lease else { continue };
             match outcome.verdict() {
@@ -202,7 +202,8 @@ async fn beat(
             return;
         }
     };
-    let mut voice = Voice { client, registration, session: None, tries_session: true, has_sessions: true };
+    let mut renewals =
+        Renewals { client, registration, session: None, tries_session: true, has_sessions: true };
     let mut due = Instant::now() + pulse.period();
     loop {
         tokio::select! {
@@ -212,9 +213,9 @@ async fn beat(
             // At once: the coordinator can report the end of a lease on the session only after it has
             // received it there.
             () = pulse.begun.notified() => {}
-            heard = voice.hear() => {
+            heard = renewals.receive() => {
                 match heard {
-                    Ok(outcomes) => pulse.heed(outcomes),
+                    Ok(outcomes) => pulse.apply(outcomes),
                     // The next beat, which comes soon, asks again and decides.
                     Err(status) => {
                         tracing::debug!(error = %status.message(), "the session ended");
@@ -228,7 +229,7 @@ async fn beat(
         if let Some((lease, progress)) = pulse.held() {
             tokio::select! {
                 biased;
-                answered = tokio::time::timeout(CALL_WITHIN, voice.renew(pulse, lease, progress)) => match answered {
+                answered = tokio::time::timeout(CALL_WITHIN, renewals.renew(pulse, lease, progress)) => match answered {
                     Ok(Ok(())) => {}
                     Ok(Err(status)) if is_sent_away(&status) => {
                         tracing::error!(reason = %status.message(), "the coordinator rejected this worker; \
@@ -247,7 +248,7 @@ async fn beat(
 }
 
 /// Renews over a session, which delivers a stop request at once, or over single calls if there is none.
-struct Voice {
+struct Renewals {
     client: WorkerServiceClient<Connection>,
     registration: v1::RegisterRequest,
     session: Option<Session>,
@@ -265,9 +266,9 @@ struct Session {
     waits: bool,
 }
 
-impl Voice {
+impl Renewals {
     /// The coordinator's messages on the session; pending for ever without one.
-    async fn hear(&mut self) -> Result<Vec<v1::RenewOutcome>, Status> {
+    async fn receive(&mut self) -> Result<Vec<v1::RenewOutcome>, Status> {
         let Some(session) = &mut self.session else { return std::future::pending().await };
         let heard = session.answers.message().await.and_then(|answer| {
             let renewed = answer.ok_or_else(|| Status::unavailable("the coordinator ended it"))?.renewed;
@@ -275,13 +276,13 @@ impl Voice {
         });
         session.waits = false;
         if heard.is_err() {
-            self.hang_up();
+            self.close();
         }
         heard
     }
 
     /// Closes the session; single calls then report why it ended and what to do.
-    fn hang_up(&mut self) {
+    fn close(&mut self) {
         self.session = None;
         self.tries_session = false;
     }
@@ -306,12 +307,12 @@ impl Voice {
                 return Ok(());
             }
             tracing::debug!("the session is silent");
-            self.hang_up();
+            self.close();
         }
         match self.client.renew(request).await {
             Ok(answer) => {
                 self.tries_session = true;
-                pulse.heed(answer.into_inner().outcomes);
+                pulse.apply(answer.into_inner().outcomes);
                 Ok(())
             }
             // The coordinator was restarted: register again with our current lease.

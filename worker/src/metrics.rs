@@ -7,7 +7,7 @@ use fathom_core::gpu::DeviceMemory;
 use fathom_observe::http::Observed;
 use fathom_observe::threads;
 use fathom_proto::stage_name;
-use fathom_proto::v1::{Progress, Stage as JobStage};
+use fathom_proto::v1::{Progress, Stage};
 use prometheus_client::encoding::text;
 use prometheus_client::metrics::counter::Counter;
 use prometheus_client::metrics::family::Family;
@@ -70,7 +70,7 @@ impl Default for Metrics {
 /// State of a GPU's session.
 #[derive(Clone, Copy, PartialEq, Eq)]
 #[repr(u8)]
-enum Stage {
+enum SessionState {
     Waits,
     Works,
     Ended,
@@ -80,7 +80,7 @@ enum Stage {
 pub struct GpuMetrics {
     all: Arc<Metrics>,
     gpu: String,
-    stage: AtomicU8,
+    state: AtomicU8,
 }
 
 impl Default for GpuMetrics {
@@ -92,8 +92,11 @@ impl Default for GpuMetrics {
 impl GpuMetrics {
     /// The metrics of adapter `number`, among `all`.
     pub fn of(all: &Arc<Metrics>, number: usize) -> Self {
-        let metrics =
-            Self { all: Arc::clone(all), gpu: number.to_string(), stage: AtomicU8::new(Stage::Waits as u8) };
+        let metrics = Self {
+            all: Arc::clone(all),
+            gpu: number.to_string(),
+            state: AtomicU8::new(SessionState::Waits as u8),
+        };
         // List every GPU from the start, with zero counts.
         all.up.get_or_create(&metrics.labels([])).set(0);
         drop(all.iterations.get_or_create(&metrics.labels([])));
@@ -112,19 +115,19 @@ impl GpuMetrics {
 
     /// The coordinator knows this GPU's session.
     pub fn registered(&self) {
-        self.stage.store(Stage::Works as u8, Ordering::Relaxed);
+        self.state.store(SessionState::Works as u8, Ordering::Relaxed);
         self.all.up.get_or_create(&self.labels([])).set(1);
     }
 
     /// The session takes no more tasks.
     pub fn session_ended(&self) {
-        self.stage.store(Stage::Ended as u8, Ordering::Relaxed);
+        self.state.store(SessionState::Ended as u8, Ordering::Relaxed);
         self.all.up.get_or_create(&self.labels([])).set(0);
         self.at_speed(0.0);
     }
 
-    fn is(&self, stage: Stage) -> bool {
-        self.stage.load(Ordering::Relaxed) == stage as u8
+    fn is(&self, state: SessionState) -> bool {
+        self.state.load(Ordering::Relaxed) == state as u8
     }
 
     /// Counts an attempt's progress since its report `before`.
@@ -135,7 +138,7 @@ impl GpuMetrics {
     }
 
     /// Counts a finished attempt.
-    pub fn ended(&self, stage: JobStage, ended: Ended) {
+    pub fn ended(&self, stage: Stage, ended: Ended) {
         self.at_speed(0.0);
         let how = match ended {
             Ended::Done => "done",
@@ -189,10 +192,10 @@ impl Observed for Endpoint {
     }
 
     async fn ready(&self) -> Result<(), String> {
-        let any = |stage| self.gpus.iter().any(|(metrics, _)| metrics.is(stage));
-        if any(Stage::Waits) {
+        let any = |state| self.gpus.iter().any(|(metrics, _)| metrics.is(state));
+        if any(SessionState::Waits) {
             Err("the coordinator has not answered yet".to_owned())
-        } else if any(Stage::Works) {
+        } else if any(SessionState::Works) {
             Ok(())
         } else {
             Err("no GPU accepts tasks".to_owned())

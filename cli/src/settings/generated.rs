@@ -12,7 +12,7 @@ use super::source::{Field, Source, first_sentence, said, unit};
 use super::{DEFAULT, Declaration, defaults, flags, shown};
 use crate::verbs::{CoordinatorSettings, WorkerSettings};
 
-/// Set, this makes the test write the files.
+/// If this variable is set, the test writes the files.
 const WRITE: &str = "FATHOM_WRITE_SETTINGS";
 
 const COLUMNS: usize = 110;
@@ -60,11 +60,11 @@ struct JobSetting {
     key: String,
     unit: String,
     default: Value,
-    /// In `paper` and `3dgs`, where they differ.
+    /// Its values in `paper` and `3dgs`, where they differ from the default.
     others: Vec<(&'static str, Value)>,
     meaning: String,
     source: String,
-    /// Where only certain words are allowed: each with its meaning.
+    /// The allowed words with their meanings; empty if any value of the type is allowed.
     values: Vec<(String, String)>,
 }
 
@@ -79,7 +79,7 @@ fn root() -> PathBuf {
     PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/.."))
 }
 
-/// By way of text, in which an f32 has the digits that people write.
+/// Converts through text, so that an f32 has the few digits that people write.
 fn json(config: &JobConfig) -> Value {
     serde_json::from_str(&serde_json::to_string(config).unwrap()).unwrap()
 }
@@ -187,7 +187,7 @@ fn row(page: &mut String, cells: &[&str]) {
     writeln!(page, "| {} |", cells.join(" | ")).unwrap();
 }
 
-/// A setting of a service: flag, variable, key, default in words, meaning.
+/// The settings of a service: flag, variable, key, default as text, meaning.
 fn service_settings<D: Declaration>() -> Vec<[String; 5]> {
     let defaults = defaults::<D>().unwrap();
     let setting = |arg: clap::Arg| {
@@ -230,7 +230,7 @@ fn service_example<D: Declaration>(verb: &str, variable: &str) -> String {
         let help = arg.get_help().map(ToString::to_string).unwrap_or_default();
         let placeholder = arg.get_value_names().and_then(|names| names.first()).map_or("VALUE", |name| name);
         match &defaults[&key] {
-            // Without a value of its own: the one that the help names comes about otherwise.
+            // There is no default value, or the help describes it in words: show a placeholder.
             default if default.is_null() || help.contains(DEFAULT) => match placeholder {
                 "N" | "BYTES" => writeln!(file, "# {key} = {placeholder}").unwrap(),
                 _ => writeln!(file, "# {key} = \"{placeholder}\"").unwrap(),
@@ -272,7 +272,7 @@ fn job_example() -> String {
     file
 }
 
-/// A value as TOML has it.
+/// A value in TOML syntax.
 fn toml(value: &Value) -> String {
     match value {
         Value::Number(number) if number.is_f64() => match number.as_f64() {

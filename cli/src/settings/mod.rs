@@ -20,12 +20,12 @@ use toml::Spanned;
 
 use crate::error::{CliError, Result};
 
-/// The settings of a service as flags: every field is optional, and is named as the key in the file.
+/// The settings of a service as flags. Every field is optional, and has the name of its key in the file.
 pub trait Declaration: Args + Serialize {
-    /// What the service reads in the end, from one value for each key.
+    /// The resolved settings, read from one value for each key.
     type Resolved: DeserializeOwned;
 
-    /// The values of a service that was given none; null where there is no value by default.
+    /// The default of every key; null for a key without a default.
     fn defaults() -> serde_json::Result<Value>;
 }
 
@@ -84,10 +84,10 @@ fn with_defaults<D: Declaration>(command: Command) -> Command {
     })
 }
 
-/// How the end of a help text begins that names a default.
+/// Start of the default at the end of a help text.
 const DEFAULT: &str = " [default: ";
 
-/// A default as people read it.
+/// A default in readable form: sizes in GiB or MiB.
 fn shown(arg: &Arg, default: &Value) -> String {
     let is_bytes = arg.get_value_names().is_some_and(|names| names.iter().any(|name| name == "BYTES"));
     match (default, default.as_u64()) {

@@ -1,6 +1,6 @@
 //! Reads the settings of a job from the source of `core::config`: keys, types and doc comments.
 //!
-//! It knows as much of Rust as that folder uses: structs with public fields, and enums of plain variants.
+//! It parses only the Rust that this folder uses: structs with public fields, and enums of plain variants.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -25,7 +25,7 @@ pub struct Field {
     pub doc: String,
 }
 
-/// A value of an enum, as it is written in a file.
+/// A variant of an enum, as it is written in a file.
 #[derive(Clone)]
 pub struct Variant {
     name: String,
@@ -34,7 +34,7 @@ pub struct Variant {
 }
 
 impl Source {
-    /// All files of a folder.
+    /// Reads all files of a folder.
     pub fn read(folder: &Path) -> Self {
         let mut source = Self::default();
         for entry in std::fs::read_dir(folder).unwrap().map(Result::unwrap) {
@@ -76,7 +76,7 @@ impl Source {
         self.enums.get(name).map(Vec::as_slice)
     }
 
-    /// A doc comment for readers who do not know the code: links to items become the keys and values meant.
+    /// A doc comment for readers who do not know the code: links to items become keys and values.
     pub fn readable(&self, doc: &str) -> String {
         let mut parts = doc.split("[`");
         let mut out = parts.next().unwrap_or_default().to_owned();
@@ -101,7 +101,7 @@ impl Source {
         }
     }
 
-    /// Where the struct `wanted` lies in the struct `within`.
+    /// The path of the struct `wanted` within the struct `within`.
     fn path_of(&self, within: &str, wanted: &str) -> Option<String> {
         self.structs.get(within)?.fields.iter().find_map(|field| {
             let below = || Some(format!("{}.{}", field.key, self.path_of(&field.of, wanted)?));
@@ -166,13 +166,13 @@ fn snake_case(name: &str) -> String {
     out
 }
 
-/// What a doc comment says of the default after its value, and everything else that it says.
+/// A doc comment without its sentence about the default, and the source and notes of that sentence.
 pub struct Said {
     pub meaning: String,
     pub source: String,
 }
 
-/// Cuts "Default VALUE (SOURCE)." out of a doc comment; `values` is 3 where a list of three is the default.
+/// Cuts "Default VALUE (SOURCE)." out of a doc comment; `values` is 3 if the default is a list of three.
 pub fn said(doc: &str, values: usize) -> Said {
     let Some(start) =
         doc.match_indices("Default").map(|(at, _)| at).find(|at| *at == 0 || doc[..*at].ends_with(". "))
@@ -190,7 +190,7 @@ pub fn said(doc: &str, values: usize) -> Said {
     };
     let after = sentence.char_indices().filter(ends_value).nth(values.saturating_sub(1));
     let note = after.map_or("", |(at, _)| &sentence[at..]).trim_start_matches([',', ';', ':']).trim();
-    // What 0 or 1 means belongs to the meaning. The column of defaults has the values of presets.
+    // The meaning of 0 or 1 goes into the meaning. Values of presets are in the column of defaults.
     let is_of_preset = |clause: &&str| {
         clause.split_once(" in ").is_some_and(|(_, of)| {
             of.trim_start_matches("the preset ").split('`').count() == 3 && of.ends_with('`')
@@ -236,7 +236,7 @@ pub fn first_sentence(text: &str) -> &str {
     end.map_or(text, |end| &text[..=end])
 }
 
-/// The unit of a number, by the words of its doc comment; `before` is that of the setting above it.
+/// The unit of a number, by the words of its doc comment; `before` is the unit of the setting above it.
 pub fn unit(of: &str, meaning: &str, before: &str) -> String {
     let sentence = first_sentence(meaning);
     let begins = |words: &str| sentence.starts_with(words);

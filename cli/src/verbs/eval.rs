@@ -313,7 +313,7 @@ fn measure(args: &EvalArgs) -> Result<Value> {
                 renderer.set_water(output);
                 let clear = renderer.render(&camera, &view.pose, [0.0; 3])?;
                 let clear = metrics::quantised(clear.width, clear.height, &clear.rgb);
-                // What was blended in sRGB a viewer shows as it is.
+                // Viewers blend in sRGB, so they show other models unchanged.
                 if water.as_ref().is_some_and(|record| record.composition.blends_in_linear_light()) {
                     renderer.set_water(None);
                     let plain = renderer.render(&camera, &view.pose, [0.0; 3])?;

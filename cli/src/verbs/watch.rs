@@ -334,7 +334,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_event_says_when_and_of_which_job_in_the_words_of_show() {
+    fn an_event_has_time_and_job_in_the_words_of_show() {
         let changed = JobStateChanged { state: JobState::Running.into(), message: String::new() };
         let event = JobEvent {
             job_id: "j".into(),

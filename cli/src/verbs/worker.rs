@@ -55,8 +55,8 @@ pub struct WorkerSettings {
     #[command(flatten)]
     #[serde(flatten)]
     dial: DialArgs,
-    /// GPU by its number in `fathom doctor`, or all for every real GPU; several (--gpu 0 --gpu 2, in the file
-    /// [0, 2]) run a task each [default: the first real GPU]
+    /// GPU number in `fathom doctor`, or all for every real GPU; several (--gpu 0 --gpu 2, in the file [0,
+    /// 2]) run a task each [default: the first real GPU]
     #[arg(long, value_name = "N", env = "FATHOM_GPU", value_delimiter = ',')]
     #[serde(skip_serializing_if = "Vec::is_empty")]
     gpu: Vec<GpuName>,

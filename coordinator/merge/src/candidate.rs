@@ -205,7 +205,7 @@ mod tests {
     }
 
     #[test]
-    fn what_agrees_is_never_beyond_the_reach_of_either() {
+    fn gaussians_that_agree_are_within_reach_of_each_other() {
         let narrow = gaussian([0.0; 3], [0.1; 3], DQuat::IDENTITY, [0.0; 3]);
         let wide = |x: f32| gaussian([x, 0.0, 0.0], [0.1499; 3], DQuat::IDENTITY, [0.0; 3]);
         let furthest = (0..200).rev().map(|i| i as f32 * 1e-3).find(|&x| agree(&narrow, &wide(x))).unwrap();
@@ -213,7 +213,7 @@ mod tests {
     }
 
     #[test]
-    fn what_has_no_shape_is_no_candidate() {
+    fn gaussians_without_a_shape_are_no_candidates() {
         let bounds = Bounds::new(&MergeConfig::default());
         let sound = Splat { log_scales: [0.0; 3], quat_wxyz: [1.0, 0.0, 0.0, 0.0], colour: [0.0; 3] };
         let is_one = |splat: Splat| {

@@ -287,7 +287,7 @@ mod tests {
     }
 
     #[test]
-    fn of_a_chain_the_middle_goes_where_it_ranks_between_its_ends() {
+    fn a_chain_loses_its_middle_if_that_ranks_between_its_ends() {
         // Neighbours are 0.4 deviations apart and agree; the ends are 0.8 apart and do not.
         let chain = |logits: [f32; 3]| {
             let of = |i: u32| ball(i % 2, i, [0.4 * i as f32, 0.0, 0.0], 1.0, logits[i as usize]);
@@ -342,7 +342,7 @@ mod tests {
         }
 
         #[test]
-        fn what_stays_holds_no_duplicates(crowd in crowd()) {
+        fn the_remaining_gaussians_hold_no_duplicates(crowd in crowd()) {
             let gone = decide(&crowd);
             let left: Vec<Candidate> = crowd.into_iter().filter(|c| !gone.contains(&c.id)).collect();
             prop_assert!(decide(&left).is_empty());

@@ -112,13 +112,13 @@ pub enum MergeError {
     /// More than one result for a partition.
     #[error("partition {partition} has two results; pass the one that its last fence accepted")]
     Twice {
-        /// Its id or path.
+        /// Its id.
         partition: PartitionId,
     },
     /// A result for a partition that the plan does not have.
     #[error("there is no partition {partition} in the plan")]
     Unknown {
-        /// Its id or path.
+        /// Its id.
         partition: PartitionId,
     },
     /// Rows that do not fit into one file.
@@ -127,7 +127,7 @@ pub enum MergeError {
          ({found} against {expected}); all partitions must be trained with one SH degree and one version"
     )]
     Layout {
-        /// Its id or path.
+        /// Its id.
         partition: PartitionId,
         /// The first partition.
         first: PartitionId,
@@ -142,7 +142,7 @@ pub enum MergeError {
          must be trained with the same one"
     )]
     Water {
-        /// Its id or path.
+        /// Its id.
         partition: PartitionId,
         /// The first partition.
         first: PartitionId,
@@ -150,7 +150,7 @@ pub enum MergeError {
     /// A file that is not a PLY of Gaussians.
     #[error("{path}: {message}", path = path.display())]
     File {
-        /// Its id or path.
+        /// Its path.
         path: PathBuf,
         /// The place and the fault.
         message: String,
@@ -160,7 +160,7 @@ pub enum MergeError {
     Io {
         /// "read", "write", ...
         action: &'static str,
-        /// Its id or path.
+        /// Its path.
         path: PathBuf,
         /// The error of the system.
         source: std::io::Error,

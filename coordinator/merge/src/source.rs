@@ -23,11 +23,11 @@ pub struct Source<'a> {
 
 /// The owner of a row.
 pub enum Place {
-    /// To the cell: its centre in the aligned frame.
+    /// The cell; the row's centre in the aligned frame.
     Cell(DVec3),
-    /// To a neighbour.
+    /// A neighbour.
     Margin,
-    /// To no partition: centre or opacity is not finite.
+    /// No partition: centre or opacity is not finite.
     Nowhere,
 }
 

@@ -34,7 +34,7 @@ pub(super) fn stage(
     let band: Vec<Rect> = segments.iter().map(|segment| segment.band(width)).collect();
     let (inside, outside): (Vec<DVec3>, Vec<DVec3>) =
         points.all().iter().partition(|point| band.iter().any(|rect| rect.contains(**point)));
-    let seeing = who_sees(&inside, candidates);
+    let seeing = views_showing(&inside, candidates);
     let iterations = config.borders.iterations_of(config.train.iterations);
     let share = inside.len() as f64 / points.all().len().max(1) as f64;
     let cap = u64::from(config.train.max_gaussians);
@@ -57,8 +57,8 @@ pub(super) fn stage(
     })
 }
 
-/// The views in whose images some of `points` lie, hidden or not; all where there are no points.
-fn who_sees(points: &[DVec3], candidates: &[Candidate]) -> Vec<Candidate> {
+/// The views in whose images some of `points` lie, hidden or not; all views if there are no points.
+fn views_showing(points: &[DVec3], candidates: &[Candidate]) -> Vec<Candidate> {
     let every = points.len().div_ceil(ASKED_POINTS).max(1);
     let sees = |candidate: &&Candidate| {
         let camera = &candidate.camera;

@@ -1,4 +1,4 @@
-//! The ground floor of a plan: the aligned frame, boxes, intervals and rectangles in it, and lines between
+//! The basic types of a plan: the aligned frame, boxes, intervals and rectangles in it, and lines between
 //! cells.
 //!
 //! Intervals are half-open, (lo, hi], so that cells which share a side share no point. Everything goes
@@ -77,7 +77,7 @@ pub enum UpRule {
     CentrePlane,
     /// The centres lie on a line or in a point: the mean viewing direction, perpendicular to that line.
     ViewingDirection,
-    /// Nothing points anywhere: the world's y axis is taken for down.
+    /// There is no evidence: the world's y axis is taken for down.
     WorldY,
 }
 

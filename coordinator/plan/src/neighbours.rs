@@ -1,5 +1,5 @@
-//! Adjacent partitions: the picture gives them different colours. (Measurement lines are in `seam_lines`,
-//! bands of the merge in the merge crate.)
+//! Adjacent partitions, which the picture gives different colours. (Measurement lines are in `seam_lines`,
+//! the bands of the merge in `fathom-merge`.)
 
 use crate::geometry::{Interval, Rect};
 use crate::plan::{PartitionId, Plan};

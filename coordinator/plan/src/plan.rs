@@ -1,9 +1,9 @@
 //! The plan as a value: the content of `plan.json`, and two membership tests.
 //!
-//! A worker asks [`Plan::focuses`] (is this Gaussian trained here?), the merge asks [`Plan::keeps`] (does
-//! this partition contribute this Gaussian?). Both go through [`Alignment::to_aligned`], so that they agree
-//! to the last bit. Every Gaussian that a partition keeps is also in its focus. So extended boxes are open
-//! where cells are; otherwise the far background would belong to no partition.
+//! [`Plan::focuses`] tests whether a partition trains a Gaussian, and [`Plan::keeps`] whether the merge takes
+//! a Gaussian from it. Both go through [`Alignment::to_aligned`], so that they agree to the last bit. Every
+//! Gaussian that a partition keeps is also in its focus. So extended boxes are open where cells are;
+//! otherwise the far background would belong to no partition.
 
 use std::fmt;
 

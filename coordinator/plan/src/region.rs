@@ -251,7 +251,7 @@ mod tests {
     }
 
     #[test]
-    fn strays_far_away_do_not_blow_a_box_up() {
+    fn distant_strays_do_not_enlarge_a_box() {
         let (cells, at) = grid_cells(2, 2);
         let near = (0..1000).map(|i| DVec3::new(f64::from(i % 80) * 0.1, 2.0, f64::from(i / 13) * 0.1));
         let strays = (0..8).map(|i| DVec3::new(1e6, -1e6, 1e6) * if i % 2 == 0 { 1.0 } else { -1.0 });

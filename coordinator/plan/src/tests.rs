@@ -438,7 +438,7 @@ fn views_that_nothing_can_be_projected_with_are_refused_by_name() {
 }
 
 #[test]
-fn views_out_of_order_and_twice_the_same_name_are_refused() {
+fn unsorted_or_repeated_view_names_are_refused() {
     for (at, name) in [(4, "view00003"), (4, "a")] {
         let mut views = survey(9);
         views[at].name = name.to_owned();

@@ -27,11 +27,11 @@ use crate::geometry::{Turn, TurnRule};
 
 /// Share of the centres that may be strays; at least one of them.
 const STRAYS: f64 = 0.05;
-/// Fewest centres of which some are left out.
+/// Fewest centres; with fewer, none is left out as a stray.
 const FEW: usize = 8;
 /// Rounds in which the middle of the centres is found without the strays.
 const ROUNDS: usize = 4;
-/// Most centres that are measured, evenly taken.
+/// Most centres that are measured; of more, an even sample is taken.
 const MOST: usize = 4096;
 /// Number of halvings, and the minimum size of a half. Four shares distinguish surveys, paths and round
 /// layouts. With more, the inner ones, which are equally compact at every angle, outvote the others.
@@ -39,15 +39,15 @@ const HALVINGS: u32 = 2;
 const FEWEST: usize = 8;
 /// Least perimeter of a rectangle, as a share of the diameter of the centres: shares may stand in one place.
 const LEAST_PERIMETER: f64 = 1e-3;
-/// Perimeters after the turn, at most, as a share of those before. A straight path turns from about 10
-/// degrees.
+/// Largest perimeter after a turn, as a share of the one before. A straight path is turned if it lies about
+/// 10 degrees off an axis.
 const WORTH_IT: f64 = 0.93;
 /// Angles within this many degrees are judged together. The longer side of a share, and so its halving, may
 /// change from one angle to the next, and that alone must not cause a turn.
 const NEARBY: i32 = 4;
-/// Directions that differ by more than this are different ones.
+/// Directions that differ by more than this count as different.
 const OTHERWISE_DEGREES: f64 = 15.0;
-/// Perimeters of which the larger is at most this many times the smaller are the same.
+/// Perimeters count as equal if the larger is at most this many times the smaller.
 const AS_GOOD: f64 = 1.04;
 
 /// The turn for centres at (x, z) of the levelled frame.
@@ -175,7 +175,7 @@ mod tests {
     }
 
     #[test]
-    fn a_survey_that_lies_askew_is_laid_along_the_axes() {
+    fn a_tilted_survey_is_turned_along_the_axes() {
         for degrees in [20.0, 30.0, 42.0, -25.0, -40.0] {
             let turn = find(&turned(&survey(), degrees));
             assert_eq!(turn.rule, TurnRule::CompactCells, "{degrees}: {turn:?}");
@@ -221,7 +221,7 @@ mod tests {
     }
 
     #[test]
-    fn a_layout_with_two_directions_that_are_as_good_keeps_its_axes() {
+    fn a_layout_with_two_equal_directions_keeps_its_axes() {
         // Two paths that cross, 40 degrees apart: shares along one are compact where those along the other
         // are not.
         let arm = |degrees: f64| {
@@ -232,7 +232,7 @@ mod tests {
     }
 
     #[test]
-    fn a_way_to_a_second_small_survey_does_not_turn_the_large_one() {
+    fn a_path_to_a_small_survey_does_not_turn_the_large_one() {
         // The case where the smallest rectangle around all of them fails: 10 x 10 along the axes, and a tenth
         // far off to one side.
         let large =

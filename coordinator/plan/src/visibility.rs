@@ -229,7 +229,7 @@ mod tests {
     }
 
     #[test]
-    fn x_is_held_against_the_width_and_y_against_the_height() {
+    fn x_is_compared_with_the_width_and_y_with_the_height() {
         // Fault 3 of the public code: it swaps the two. A box that projects to x in 500..600 and y in
         // 10..110: inside a picture of 640x480, but outside of one of 480x640.
         let at = |u: f64, v: f64| [(u - CAMERA.cx) / CAMERA.fx * 4.0, (v - CAMERA.cy) / CAMERA.fy * 4.0];

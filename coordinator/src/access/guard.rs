@@ -275,7 +275,7 @@ mod tests {
     }
 
     #[test]
-    fn who_is_refused_is_told_which_role_a_call_needs() {
+    fn a_refusal_names_the_roles_that_the_call_needs() {
         for (path, need) in [
             ("fathom.worker.v1.WorkerService/Claim", "running a worker needs the role worker"),
             ("fathom.v1.JobService/CreateJob", "CreateJob needs the role submitter or operator"),
@@ -292,7 +292,7 @@ mod tests {
     }
 
     #[test]
-    fn each_role_may_call_what_it_is_for_and_nothing_else() {
+    fn each_role_permits_exactly_its_own_methods() {
         let viewer = allowed(&caller(Role::Viewer, Some("reef")));
         let looks = ["GetJob", "ListJobs", "WatchJob", "StreamLogs", "ListArtifacts"];
         let mut wanted: Vec<String> = looks.iter().map(|method| format!("{JOBS}/{method}")).collect();

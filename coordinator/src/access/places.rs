@@ -5,9 +5,9 @@
 //! without a place wait in order of arrival. The users of one tenant share a part of the places, so that they
 //! can only delay each other, and workers have their own places.
 //!
-//! At worst that is 32 requests of users, of 12 MiB each (`MAX_UPLOAD_MESSAGE_BYTES`), and 160 pieces of a
-//! MiB of uploads. Downloads have 448 pieces of a quarter of a MiB, of which HTTP/2 holds two or three each.
-//! No tenant has more than a quarter of the users' places.
+//! At worst that is 32 requests of users, of 12 MiB each (`MAX_UPLOAD_MESSAGE_BYTES`), and 160 uploads with a
+//! piece of a MiB each. 448 downloads hold two or three pieces of a quarter of a MiB each, in HTTP/2. No
+//! tenant has more than a quarter of the users' places.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};

@@ -67,7 +67,7 @@ mod tests {
     }
 
     #[test]
-    fn no_limit_is_none() {
+    fn a_rate_of_zero_sets_no_limit() {
         let limit = RateLimit::new(0);
         assert!((0..10_000).all(|_| limit.take(&Tenant::default(), 0).is_ok()));
     }

@@ -121,7 +121,7 @@ mod tests {
     use crate::access::Role;
 
     #[test]
-    fn only_a_token_that_holds_opens_the_door() {
+    fn only_a_valid_token_is_admitted() {
         let token = Token::random();
         let record = TokenRecord::new(&token, "ci".into(), Role::Viewer, None, 0, Some(100));
         let access = Access::by_tokens(vec![record.clone()]);
@@ -145,7 +145,7 @@ mod tests {
     }
 
     #[tokio::test(start_paused = true)]
-    async fn a_caller_is_told_when_its_token_is_revoked_or_expires() {
+    async fn a_wait_ends_when_the_token_is_revoked_or_expires() {
         let clock = Clock::starting_at(1000);
         let [revoked, expires] = [(); 2].map(|()| Token::random());
         let record =
@@ -169,7 +169,7 @@ mod tests {
     }
 
     #[test]
-    fn an_open_door_lets_everybody_in() {
+    fn every_caller_is_admitted_where_no_token_is_required() {
         let access = Access::open();
         assert_eq!(access.principal(None, 0), Ok(Principal::anonymous()));
         assert!(access.still_holds(&Principal::anonymous(), u64::MAX));

@@ -178,7 +178,7 @@ mod tests {
     }
 
     #[test]
-    fn what_can_be_no_token_is_none() {
+    fn malformed_tokens_do_not_parse() {
         let good = Token::random().reveal();
         for wrong in ["", "fathom", "fathom__", &good[1..], &good[..good.len() - 1], &good.to_uppercase()] {
             assert_eq!(Token::parse(wrong), None, "{wrong}");
@@ -187,7 +187,7 @@ mod tests {
     }
 
     #[test]
-    fn a_token_that_nobody_can_mean_is_refused_by_the_field() {
+    fn invalid_token_settings_are_refused_by_field() {
         let issue =
             |name: &str, role, tenant, seconds| TokenRecord::issue(name.to_owned(), role, tenant, seconds, 5);
         let field = |issued: Result<_, IssueError>| issued.err().map(|error| error.field);

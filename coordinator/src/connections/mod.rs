@@ -81,7 +81,7 @@ impl Connections {
             };
             all.ended.crowded += 1;
             all.ended.from = state.from;
-            // It would count until it is dropped, which happens at once; this one must not wait for that.
+            // It counts until it is dropped, which happens soon; the new connection must not wait for that.
             all.open = all.open.saturating_sub(1);
             state.end(true);
         }

@@ -60,7 +60,7 @@ async fn one_stranger_too_many_ends_the_one_silent_for_longest() {
 }
 
 #[tokio::test]
-async fn callers_with_tokens_are_never_sent_away_for_strangers() {
+async fn callers_with_tokens_are_never_closed_for_strangers() {
     let connections = connections(4, 3);
     let held: Vec<_> = (0..3).map(|_| enter(&connections)).collect();
     for (connection, _) in &held {

@@ -308,7 +308,7 @@ mod tests {
     }
 
     #[test]
-    fn every_file_that_cannot_be_there_is_named_with_the_reason() {
+    fn every_invalid_file_is_named_with_the_reason() {
         let decomposed = "ta\u{308}uchung.jpg";
         let paths =
             ["good.jpg", "../x", "/etc/passwd", "a\\b", "a\0b", decomposed, "good.jpg", "good.jpg/x", ""];

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 use super::{Attempt, JobLog, Row};
 
-/// Upper bound of a row: a message has 4096 bytes, each of which may take six in JSON.
+/// Upper bound of a row: a message has 4096 bytes, and each may take six in JSON.
 pub const MAX_ROW_BYTES: u64 = 32 << 10;
 
 /// Written after a truncated line, so that any part of the line is invalid JSON.

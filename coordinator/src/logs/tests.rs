@@ -71,7 +71,7 @@ fn lines_arrive_in_order_and_once_wherever_a_reader_resumes() {
 }
 
 #[test]
-fn a_line_that_comes_twice_is_kept_once_also_over_a_restart() {
+fn a_repeated_line_is_stored_once_even_across_a_restart() {
     let dir = tempfile::tempdir().unwrap();
     let mut before = 0;
     for run in 0..3 {

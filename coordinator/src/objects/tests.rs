@@ -13,7 +13,7 @@ fn open() -> (tempfile::TempDir, Arc<BlobStore>) {
 }
 
 #[tokio::test]
-async fn an_upload_goes_on_where_it_broke_off_also_in_another_process() {
+async fn a_broken_upload_resumes_even_in_another_process() {
     let (dir, store) = open();
     let content = vec![7_u8; 100_000];
     let blob = blob_of(&content);
@@ -75,7 +75,7 @@ async fn two_streams_do_not_write_one_blob() {
 }
 
 #[tokio::test]
-async fn a_name_that_is_no_digest_reaches_no_file() {
+async fn an_invalid_digest_reaches_no_file() {
     let (_dir, store) = open();
     for digest in ["", "..", "../../etc/passwd", &"A".repeat(64), &"../".repeat(22)[..64]] {
         let blob = BlobRef { digest: digest.to_owned(), bytes: 1 };
@@ -103,7 +103,7 @@ async fn a_nearly_full_disk_refuses_uploads() {
 }
 
 #[tokio::test]
-async fn what_a_dead_process_was_writing_is_removed_and_blobs_stay() {
+async fn unfinished_files_are_removed_and_blobs_stay() {
     let (_dir, store) = open();
     let blob = store.put(Bytes::from_static(b"a model")).await.unwrap();
     std::fs::write(store.staging_path("merge-1-2.ply"), b"half a model").unwrap();
@@ -114,7 +114,7 @@ async fn what_a_dead_process_was_writing_is_removed_and_blobs_stay() {
 }
 
 #[tokio::test]
-async fn what_is_old_goes_unless_it_is_used_or_asked_for() {
+async fn old_blobs_are_removed_unless_used_or_checked() {
     let (dir, store) = open();
     let mut blobs = Vec::new();
     for name in ["used", "asked", "old", "young"] {
@@ -154,7 +154,7 @@ async fn what_is_old_goes_unless_it_is_used_or_asked_for() {
 }
 
 #[tokio::test]
-async fn files_are_as_old_as_the_clock_of_the_coordinator_says() {
+async fn the_age_of_files_follows_the_coordinators_clock() {
     let dir = tempfile::tempdir().unwrap();
     let in_1999 = Clock::starting_at(925_000_000_000);
     let store = Arc::new(BlobStore::open(dir.path(), 0, in_1999).unwrap());
@@ -195,7 +195,7 @@ async fn files_from_the_future_count_as_made_now() {
 }
 
 #[tokio::test]
-async fn a_blob_that_is_larger_than_what_it_is_said_to_be_is_not_read() {
+async fn a_blob_larger_than_its_type_allows_is_not_read() {
     let (_dir, store) = open();
     let blob = store.put(Bytes::from(vec![7_u8; 1000])).await.unwrap();
     assert_eq!(store.read_at_most(&blob, 1000).await.unwrap().len(), 1000);

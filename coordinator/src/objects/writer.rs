@@ -62,7 +62,7 @@ impl BlobWriter {
         }
         if self.written + data.len() as u64 > self.blob.bytes {
             let declared = self.blob.bytes;
-            return Err(self.throw_away(format!("more than the declared {declared} bytes arrived")).await);
+            return Err(self.discard(format!("more than the declared {declared} bytes arrived")).await);
         }
         let (file, piece, now) = (Arc::clone(&self.file), data.clone(), self.claim.store.clock.system_time());
         spawn_io(&self.path, move || {
@@ -90,11 +90,11 @@ impl BlobWriter {
     pub async fn finish(mut self) -> Result<(), ObjectError> {
         if self.written != self.blob.bytes {
             let message = format!("{} of {} bytes arrived", self.written, self.blob.bytes);
-            return Err(self.throw_away(message).await);
+            return Err(self.discard(message).await);
         }
         let found = self.hasher.finalize().to_hex();
         if found.as_str() != self.blob.digest {
-            return Err(self.throw_away(format!("the received bytes have the digest {found}")).await);
+            return Err(self.discard(format!("the received bytes have the digest {found}")).await);
         }
         self.sync().await?;
         // The digest covers the bytes of this writer. A write of an abandoned upload may still be in flight
@@ -109,7 +109,7 @@ impl BlobWriter {
             let declared = self.blob.bytes;
             let message =
                 format!("{on_disk} bytes are on the disk, {declared} were declared; upload it again");
-            return Err(self.throw_away(message).await);
+            return Err(self.discard(message).await);
         }
         let from = ObjectPath::from_iter(["uploads", &part_name(&self.blob.digest)]);
         let to = object_path(&self.blob.digest)?;
@@ -124,7 +124,7 @@ impl BlobWriter {
         spawn_io(&self.path, move || file.sync_all()).await
     }
 
-    async fn throw_away(&mut self, message: String) -> ObjectError {
+    async fn discard(&mut self, message: String) -> ObjectError {
         let path = self.path.clone();
         match spawn_io(&self.path, move || std::fs::remove_file(&path)).await {
             Ok(()) => {

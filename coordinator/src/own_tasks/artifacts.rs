@@ -200,7 +200,7 @@ fn cameras_json(views: &[TrainView]) -> Value {
     Value::Array(views.iter().enumerate().map(camera).collect())
 }
 
-/// The water of the model as a `WaterRecord`. Where partitions refined it, it includes the result of each: a
+/// The water of the model as a `WaterRecord`. If partitions trained it, it includes the result of each: a
 /// list of `PartitionWater` as `partitions`. `None` where there is no medium.
 fn water_json(report: &MergeReport, consensus: Option<&Consensus>) -> Option<Value> {
     let mut water = json!(report.water.as_ref()?);

@@ -1,6 +1,6 @@
-//! The exchange between the two tasks of partitions, from the results of the first tasks. Where partitions
-//! refine the water, it is one water for the rest of the job. Where they end beside their neighbours, it is
-//! the Gaussians of every cell.
+//! The exchange between the two parts of partitions, computed from the results of the first parts. If
+//! partitions train the water jointly, it has one water for the rest of the job. If they end beside their
+//! neighbours, it has the Gaussians of every cell.
 //!
 //! It is a function of committed results alone, so a coordinator that crashes during it produces the same
 //! bytes again.
@@ -26,7 +26,7 @@ const FORMAT: u32 = 1;
 /// Longest [`Refined`], bytes: some thirty numbers and a reference.
 pub const MAX_REFINED_BYTES: u64 = 64 << 10;
 
-/// Computes the input of the second tasks, once all first tasks are done.
+/// Computes the input of the second parts, once all first parts are done.
 pub async fn find(objects: &BlobStore, view: &JobView) -> Result<TaskOutput, OwnTaskError> {
     let config = config_of(&view.job)?;
     let mut said = Vec::new();
@@ -58,7 +58,7 @@ pub async fn find(objects: &BlobStore, view: &JobView) -> Result<TaskOutput, Own
     Ok(TaskOutput::of(Stage::Exchange, objects.put(json.into()).await?, TaskStats::default()))
 }
 
-/// The consensus water of the first tasks.
+/// The consensus of the water parameters that the first parts found.
 async fn water_of(
     objects: &BlobStore,
     view: &JobView,
@@ -103,7 +103,7 @@ fn check_refined(partition: u32, refined: &Refined) -> Result<(), OwnTaskError> 
     Err(fault_of(partition, &format!("it has format {format} and belongs to partition {said}")))
 }
 
-/// The evidence of a first task, checked against its partition.
+/// The evidence of a first part, checked against its partition.
 pub fn evidence_of(partition: u32, refined: &Refined) -> Result<PartitionEvidence, OwnTaskError> {
     check_refined(partition, refined)?;
     let refuse = |why: String| fault_of(partition, &why);
@@ -117,7 +117,8 @@ pub fn evidence_of(partition: u32, refined: &Refined) -> Result<PartitionEvidenc
     };
     let water = Water { beta_d: three(beta_d)?, beta_b: three(beta_b)?, b_inf: three(b_inf)? };
     let evidence = evidence.as_slice().try_into();
-    let evidence = evidence.map_err(|_| refuse("its evidence does not have nine numbers".into()))?;
+    let evidence = evidence
+        .map_err(|_| refuse("its evidence does not have one number for each water parameter".into()))?;
     Ok(PartitionEvidence { partition, water, evidence })
 }
 
@@ -136,7 +137,7 @@ fn log(view: &JobView, coarse: &Water, found: &Consensus) {
     );
 }
 
-/// The consensus of a job's partitions; `None` where they did not refine the water.
+/// The consensus of a job's partitions; `None` if they did not train the water.
 pub async fn read(objects: &BlobStore, view: &JobView) -> Result<Option<Consensus>, OwnTaskError> {
     let Some(blob) = view.job.output(Artifact::Exchange) else { return Ok(None) };
     let json = objects.read(blob).await?;

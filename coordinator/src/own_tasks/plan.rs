@@ -253,7 +253,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_task_is_told_how_far_its_own_views_are_clear() {
+    fn a_task_gets_the_clear_ranges_of_its_own_views() {
         let camera = PinholeCamera { width: 64, height: 48, fx: 50.0, fy: 50.0, cx: 32.0, cy: 24.0 };
         let views: Vec<TrainView> = (0..20)
             .map(|i| {

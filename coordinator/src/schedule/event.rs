@@ -107,9 +107,9 @@ pub enum Expired {
 pub enum Event {
     /// A worker takes a ready task, or starts a duplicate attempt at a slow one.
     Claim {
-        /// The id.
+        /// The task.
         task: TaskId,
-        /// The worker or lease.
+        /// The worker.
         worker: WorkerProfile,
         /// All workers that are connected.
         peers: Arc<[WorkerProfile]>,
@@ -122,7 +122,7 @@ pub enum Event {
     },
     /// A checkpoint has been uploaded.
     Checkpoint {
-        /// The worker or lease.
+        /// The lease.
         lease: Lease,
         /// The bytes.
         blob: BlobRef,
@@ -131,7 +131,7 @@ pub enum Event {
     },
     /// A result has been uploaded.
     Complete {
-        /// The worker or lease.
+        /// The lease.
         lease: Lease,
         /// The result.
         output: TaskOutput,
@@ -189,9 +189,9 @@ pub enum Event {
     Retry,
     /// The user changes settings of the job.
     Update {
-        /// See [`super::JobRecord::priority`]; `None` leaves it.
+        /// See [`super::JobRecord::priority`]; `None` keeps the current value.
         priority: Option<i32>,
-        /// See [`super::JobRecord::max_parallel`]; `None` leaves it.
+        /// See [`super::JobRecord::max_parallel`]; `None` keeps the current value.
         max_parallel: Option<u32>,
     },
 }
@@ -223,9 +223,9 @@ pub enum EventBody {
     },
     /// A task was leased, requeued or ended.
     Task {
-        /// The id.
+        /// The task.
         task: TaskId,
-        /// The new state's name.
+        /// The new state.
         state: TaskChange,
         /// The attempt.
         attempt: u32,

@@ -196,7 +196,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_lacking_is_said_with_need_and_stock() {
+    fn a_shortfall_names_the_needed_and_the_available_memory() {
         let need = task(3 << 30, &[]).need();
         assert_eq!(Shortfall::of(&Tenant::default(), need, &[peer("silent", None)]), None);
         assert_eq!(Shortfall::of(&Tenant::default(), need, &[]), Some(Shortfall::Workers));

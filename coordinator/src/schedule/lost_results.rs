@@ -135,15 +135,15 @@ mod tests {
 
         /// Up to the merge, which is running.
         fn merging(max_losses: u32) -> (Self, Vec<Lease>) {
-            let mut bench = Self::new(max_losses);
+            let mut two = Self::new(max_losses);
             let mut leases = Vec::new();
             for task in [Stage::Plan.task(), Stage::Partition.task_of(0), Stage::Partition.task_of(1)] {
-                let lease = bench.take(task);
+                let lease = two.take(task);
                 leases.push(lease.clone());
-                bench.complete(lease).unwrap();
+                two.complete(lease).unwrap();
             }
-            leases.push(bench.take(Stage::Merge.task()));
-            (bench, leases)
+            leases.push(two.take(Stage::Merge.task()));
+            (two, leases)
         }
 
         fn lose(&mut self, lease: &Lease, tasks: &[TaskId]) -> Result<Outcome, Refusal> {
@@ -153,59 +153,59 @@ mod tests {
     }
 
     #[test]
-    fn a_lost_result_is_made_again_and_then_merged() {
-        let (mut bench, leases) = TwoPartitions::merging(5);
+    fn a_lost_result_is_retrained_and_then_merged() {
+        let (mut two, leases) = TwoPartitions::merging(5);
         let [_, _, second, merge] = &leases[..] else { panic!("{leases:?}") };
-        let events = bench.lose(merge, &[Stage::Partition.task_of(1)]).unwrap();
+        let events = two.lose(merge, &[Stage::Partition.task_of(1)]).unwrap();
         assert!(matches!(events, Outcome::Changed(events) if events.len() == 3));
-        let job = &bench.rows.job;
+        let job = &two.rows.job;
         assert_eq!((job.stage, job.open_tasks, job.leased_tasks), (Stage::Partition, 1, 0));
         assert_eq!((job.iterations_done, job.iterations_total), (10, 20));
-        assert_eq!(bench.rows.tasks[&Stage::Merge.task()].state, TaskState::Blocked);
-        assert_eq!(bench.rows.tasks[&Stage::Partition.task_of(1)].losses, 1);
+        assert_eq!(two.rows.tasks[&Stage::Merge.task()].state, TaskState::Blocked);
+        assert_eq!(two.rows.tasks[&Stage::Partition.task_of(1)].losses, 1);
         // No earlier lease counts any more, and intact results stay.
-        assert!(matches!(bench.complete(second.clone()), Err(Refusal::StaleFence { .. })));
-        assert!(matches!(bench.lose(merge, &[Stage::Partition.task_of(0)]), Err(Refusal::StaleFence { .. })));
-        assert!(matches!(bench.rows.tasks[&Stage::Partition.task_of(0)].state, TaskState::Done { .. }));
+        assert!(matches!(two.complete(second.clone()), Err(Refusal::StaleFence { .. })));
+        assert!(matches!(two.lose(merge, &[Stage::Partition.task_of(0)]), Err(Refusal::StaleFence { .. })));
+        assert!(matches!(two.rows.tasks[&Stage::Partition.task_of(0)].state, TaskState::Done { .. }));
 
-        let again = bench.take(Stage::Partition.task_of(1));
-        bench.complete(again).unwrap();
-        assert_eq!((bench.rows.job.stage, bench.rows.job.open_tasks), (Stage::Merge, 1));
-        assert_eq!((bench.rows.job.iterations_done, bench.take(Stage::Merge.task()).attempt), (20, 2));
+        let again = two.take(Stage::Partition.task_of(1));
+        two.complete(again).unwrap();
+        assert_eq!((two.rows.job.stage, two.rows.job.open_tasks), (Stage::Merge, 1));
+        assert_eq!((two.rows.job.iterations_done, two.take(Stage::Merge.task()).attempt), (20, 2));
     }
 
     #[test]
     fn a_disk_that_keeps_losing_results_fails_the_job() {
-        let (mut bench, leases) = TwoPartitions::merging(2);
-        bench.lose(&leases[3], &[Stage::Partition.task_of(0), Stage::Partition.task_of(1)]).unwrap();
+        let (mut two, leases) = TwoPartitions::merging(2);
+        two.lose(&leases[3], &[Stage::Partition.task_of(0), Stage::Partition.task_of(1)]).unwrap();
         for task in [Stage::Partition.task_of(0), Stage::Partition.task_of(1)] {
-            let lease = bench.take(task);
-            bench.complete(lease).unwrap();
+            let lease = two.take(task);
+            two.complete(lease).unwrap();
         }
-        let merge = bench.take(Stage::Merge.task());
-        bench.lose(&merge, &[Stage::Partition.task_of(0)]).unwrap();
-        let job = &bench.rows.job;
+        let merge = two.take(Stage::Merge.task());
+        two.lose(&merge, &[Stage::Partition.task_of(0)]).unwrap();
+        let job = &two.rows.job;
         assert_eq!((job.state, job.open_tasks, job.leased_tasks), (JobState::Failed, 0, 0));
         let parts = ["partition-0000 failed for good", "has the digest 7"];
         assert!(parts.iter().all(|part| job.error.contains(part)), "{}", job.error);
 
         // On another disk a retry makes the lost results, and then merges.
-        bench.apply(Event::Retry).unwrap();
-        let job = &bench.rows.job;
+        two.apply(Event::Retry).unwrap();
+        let job = &two.rows.job;
         assert_eq!((job.stage, job.open_tasks), (Stage::Partition, 1));
-        let lease = bench.take(Stage::Partition.task_of(0));
-        bench.complete(lease).unwrap();
-        assert_eq!((bench.rows.job.stage, bench.rows.job.open_tasks), (Stage::Merge, 1));
-        bench.take(Stage::Merge.task());
+        let lease = two.take(Stage::Partition.task_of(0));
+        two.complete(lease).unwrap();
+        assert_eq!((two.rows.job.stage, two.rows.job.open_tasks), (Stage::Merge, 1));
+        two.take(Stage::Merge.task());
     }
 
     #[test]
     fn only_partitions_that_are_done_can_be_lost() {
-        let (mut bench, leases) = TwoPartitions::merging(5);
-        let before = bench.rows.tasks.clone();
+        let (mut two, leases) = TwoPartitions::merging(5);
+        let before = two.rows.tasks.clone();
         for task in [Stage::Plan.task(), Stage::Merge.task(), Stage::Partition.task_of(7)] {
-            assert_eq!(bench.lose(&leases[3], &[task]), Err(Refusal::WrongOutput(Stage::Merge.task())));
+            assert_eq!(two.lose(&leases[3], &[task]), Err(Refusal::WrongOutput(Stage::Merge.task())));
         }
-        assert_eq!(bench.rows.tasks, before);
+        assert_eq!(two.rows.tasks, before);
     }
 }

@@ -307,11 +307,11 @@ impl OpenJob {
         })
     }
 
-    fn look_for_usual_pace(&mut self, kind: Stage) {
-        let of_kind = self.paces_ms.iter().filter(|(task, _)| task.stage == kind);
-        match usual_pace_ms(of_kind.map(|(_, pace_ms)| *pace_ms)) {
-            Some(pace_ms) => drop(self.usual_paces_ms.insert(kind, pace_ms)),
-            None => drop(self.usual_paces_ms.remove(&kind)),
+    fn look_for_usual_pace(&mut self, stage: Stage) {
+        let of_stage = self.paces_ms.iter().filter(|(task, _)| task.stage == stage);
+        match usual_pace_ms(of_stage.map(|(_, pace_ms)| *pace_ms)) {
+            Some(pace_ms) => drop(self.usual_paces_ms.insert(stage, pace_ms)),
+            None => drop(self.usual_paces_ms.remove(&stage)),
         }
     }
 }

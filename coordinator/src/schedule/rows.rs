@@ -1,4 +1,4 @@
-//! What the rules share: budgets, the rows of a job, the end of a job, and events about tasks.
+//! Parts shared by the rules: budgets, the rows of a job, the end of a job, and events about tasks.
 
 use std::collections::BTreeMap;
 

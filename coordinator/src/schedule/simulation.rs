@@ -495,7 +495,7 @@ fn output(task: TaskId, result: BlobRef, seed: u32) -> TaskOutput {
 }
 
 #[test]
-fn every_seed_commits_each_task_once_by_a_lease_that_runs() {
+fn every_seed_commits_each_task_once_by_a_live_lease() {
     simulate(300);
 }
 

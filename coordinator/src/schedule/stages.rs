@@ -9,9 +9,9 @@ use std::fmt;
 use fathom_proto::{v1, worker::v1 as worker_v1};
 use serde::{Deserialize, Serialize};
 
-/// A stage of a job, and the kind of its tasks. Stages follow each other, and compare, in the order of
-/// [`STAGES`]. Their numbers are those of `Stage` in `job.proto` and part of keys in the store: they never
-/// change, and a new stage takes the next free one, wherever its place is.
+/// A stage of a job. Stages follow each other, and compare, in the order of [`STAGES`]. Their numbers are
+/// those of `Stage` in `job.proto` and part of keys in the store, so they never change. A new stage takes the
+/// next free number, wherever it is in the table.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 #[repr(u8)]
@@ -328,7 +328,7 @@ mod tests {
     }
 
     #[test]
-    fn stages_compare_by_their_place_in_the_table_whatever_their_numbers() {
+    fn stages_compare_by_their_place_in_the_table() {
         let mut sorted: Vec<Stage> = Stage::all().collect();
         sorted.sort_by_key(|stage| std::cmp::Reverse(*stage as u8));
         sorted.sort_unstable();

@@ -37,7 +37,7 @@ pub fn time_left(
 /// Iterations of a task that are already done.
 fn iteration(task: &TaskRecord, live: Option<&LiveProgress>) -> u32 {
     let checkpoint = task.checkpoint.as_ref().map_or(0, |checkpoint| checkpoint.iteration);
-    // The iterations of a first part and its second part count on: those before a task are not its own.
+    // Both count from the beginning of the task, also in the second part of a partition.
     live.map_or(0, |live| live.iteration).max(checkpoint)
 }
 
@@ -113,7 +113,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_is_said_before_anything_was_measured() {
+    fn there_is_no_estimate_before_the_first_measurement() {
         let job = job(1);
         assert_eq!(time_left(&job, &[task(Stage::Partition.task_of(0), 100, None)], 4), None);
         assert_eq!(time_left(&job, &[task(Stage::Partition.task_of(0), 100, Some((0, 0.0)))], 4), None);

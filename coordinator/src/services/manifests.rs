@@ -115,7 +115,7 @@ pub async fn lost(objects: &BlobStore, manifest: &BlobRef) -> Result<Vec<String>
 }
 
 /// The error of a job that lacks some of its files.
-pub fn said_of_lost(names: &[String]) -> String {
+pub fn message_of_lost(names: &[String]) -> String {
     let shown = names.iter().take(MOST_SHOWN).cloned().collect::<Vec<_>>().join(", ");
     let more = names.len().saturating_sub(MOST_SHOWN);
     let more = if more > 0 { format!(" and {more} more") } else { String::new() };

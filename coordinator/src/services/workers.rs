@@ -239,7 +239,7 @@ impl Workers {
         let lost = manifests::lost(&objects, &job.manifest).await;
         let lost =
             lost.inspect_err(|error| tracing::warn!(job = %lease.job, %error, "cannot check for lost files"));
-        lost.ok().filter(|lost| !lost.is_empty()).map(|lost| manifests::said_of_lost(&lost))
+        lost.ok().filter(|lost| !lost.is_empty()).map(|lost| manifests::message_of_lost(&lost))
     }
 
     /// The blob store of a lease's job.

@@ -299,7 +299,7 @@ pub enum StoreError {
     /// A tenant has reached its limit of open jobs.
     #[error("{tenant} has {limit} open jobs, which is its limit; wait until one ends, or cancel one")]
     TooManyJobs {
-        /// Its id.
+        /// The tenant.
         tenant: Tenant,
         /// The limit.
         limit: u32,

@@ -84,14 +84,14 @@ impl Acknowledged {
                 (1..=view.job.last_seq).collect::<Vec<_>>(),
                 "round {round}: events of {job}"
             );
-            let tells_done = |task: &TaskId| {
+            let is_reported_done = |task: &TaskId| {
                 events.iter().any(|event| {
                     matches!(&event.body, EventBody::Task { task: of, state: TaskChange::Done, .. } if of == task)
                 })
             };
             for (record, _) in &view.tasks {
                 let is_done = matches!(record.state, TaskState::Done { .. });
-                assert_eq!(is_done, tells_done(&record.task), "round {round}: {job} {}", record.task);
+                assert_eq!(is_done, is_reported_done(&record.task), "round {round}: {job} {}", record.task);
             }
             views.insert(job, view);
         }
@@ -127,9 +127,9 @@ impl Acknowledged {
             }
             if *id == Stage::Exchange.task() {
                 let found = views[job].job.output(Artifact::Exchange).map(|blob| &blob.digest);
-                assert_eq!(found, Some(digest), "round {round}: {job} has another consensus");
+                assert_eq!(found, Some(digest), "round {round}: {job} has another exchange");
             }
-            // The model of a job is that of its merge until its borders are refined.
+            // The model of a job is that of its merge until its borders are trained.
             let replaced = |(task, _): &(TaskRecord, _)| {
                 task.task == Stage::Borders.task() && matches!(task.state, TaskState::Done { .. })
             };
@@ -244,7 +244,7 @@ pub fn output(task: TaskId, fence: u64) -> TaskOutput {
                 }
                 tasks.insert(Stage::Partition.task_of(index as u32), planned(side));
             }
-            // Every third one refines its borders.
+            // Every third one trains its borders.
             tasks.extend(fence.is_multiple_of(3).then(|| (Stage::Borders.task(), planned("borders"))));
             TaskOutput::planned(result, blob("picture"), Planned { tasks, warnings: Vec::new() })
         }

@@ -258,7 +258,7 @@ mod tests {
     }
 
     #[test]
-    fn numbers_in_text_become_those_that_readers_stumble_over() {
+    fn numbers_in_text_become_edge_cases() {
         assert_eq!(number_behind(b"a -7e2 b", 0), Some(2..6));
         assert_eq!(number_behind(b"a -7e2 b", 4), Some(2..6));
         assert_eq!(number_behind(b"none", 0), None);

@@ -31,7 +31,7 @@ struct Reading {
 /// The current input of each thread.
 static NOW: Mutex<Vec<Reading>> = Mutex::new(Vec::new());
 
-/// Seed and number of what this thread reads.
+/// Seed and number of the input that this thread reads.
 pub fn current() -> (u64, u64) {
     CURRENT.get()
 }

@@ -128,12 +128,12 @@ impl DiskStore {
         StoreError::Failed(failure)
     }
 
-    fn is_unlucky(&self) -> bool {
+    fn fails_now(&self) -> bool {
         self.world.has_faults() && self.draw(|random| random.permille(3))
     }
 
     /// Delays this many calls per thousand, so that they arrive outdated.
-    async fn tarry(&self, share: u64) {
+    async fn delay(&self, share: u64) {
         if self.world.has_faults() && self.draw(|random| random.permille(share)) {
             let takes = self.draw(|random| random.ms(200, 7000));
             tokio::time::sleep(takes).await;
@@ -141,7 +141,7 @@ impl DiskStore {
     }
 
     /// Whether a call arrives twice.
-    fn comes_twice(&self) -> bool {
+    fn arrives_twice(&self) -> bool {
         let twice = self.world.has_faults() && self.draw(|random| random.permille(100));
         self.world.counts(|counts| counts.repeated += u64::from(twice));
         twice
@@ -154,7 +154,7 @@ impl DiskStore {
         make: impl Future<Output = Result<T, StoreError>>,
     ) -> Result<T, StoreError> {
         self.check()?;
-        if self.is_unlucky() {
+        if self.fails_now() {
             return Err(self.fail("before a change"));
         }
         let made = make.await?;
@@ -162,7 +162,7 @@ impl DiskStore {
             self.made.fetch_add(1, Ordering::SeqCst);
         }
         self.settled().await?;
-        if has_changed(&made) && self.is_unlucky() {
+        if has_changed(&made) && self.fails_now() {
             return Err(self.fail("after a change"));
         }
         Ok(made)
@@ -276,7 +276,7 @@ fn came_under(event: &Event) -> Option<(Lease, &'static str)> {
 #[async_trait]
 impl JobStore for DiskStore {
     async fn submit(&self, mut new: NewJob, now_ms: u64) -> Result<JobRecord, StoreError> {
-        self.tarry(40).await;
+        self.delay(40).await;
         if self.world.is_off(Safeguard::Requests) {
             // Forget all earlier requests.
             new.request_id = format!("{} {}", new.request_id, new.job_id);
@@ -285,11 +285,11 @@ impl JobStore for DiskStore {
     }
 
     async fn claim(&self, claim: &Claim, now_ms: u64) -> Result<Option<Grant>, StoreError> {
-        self.tarry(40).await;
+        self.delay(40).await;
         let ready = self.memory.ready().await?;
         let claimed = async {
             let Some(grant) = self.memory.claim(claim, now_ms).await? else { return Ok(None) };
-            if self.comes_twice() {
+            if self.arrives_twice() {
                 let again = self.memory.claim(claim, now_ms).await?.map(|grant| grant.lease);
                 if again.as_ref() != Some(&grant.lease) {
                     self.world.history.note(Fact::TwoLeases { first: grant.lease.clone(), again });
@@ -322,7 +322,7 @@ impl JobStore for DiskStore {
         progress: Option<LiveProgress>,
         now_ms: u64,
     ) -> Result<Renewed, StoreError> {
-        self.tarry(40).await;
+        self.delay(40).await;
         self.check()?;
         let renewed = self.memory.renew(lease, progress, now_ms).await?;
         if renewed == Renewed::Over {
@@ -332,7 +332,7 @@ impl JobStore for DiskStore {
     }
 
     async fn apply(&self, job: &JobId, event: Event, now_ms: u64) -> Result<Outcome, StoreError> {
-        self.tarry(100).await;
+        self.delay(100).await;
         let came = came_under(&event).map(|(lease, how)| {
             let running = self.running_beside(&lease);
             (lease, how, running)
@@ -346,7 +346,7 @@ impl JobStore for DiskStore {
             if let (Some((lease, ..)), Outcome::Changed(_), false) = (&came, &outcome, is_checkpoint) {
                 self.ended(lease, is_result);
             }
-            if self.comes_twice() {
+            if self.arrives_twice() {
                 // Whatever the answer to the second call, the history must be as if it had not happened.
                 let again = self.memory.apply(job, event, now_ms).await;
                 if let (Some((lease, how, _)), Ok(Outcome::Changed(_))) = (came.clone(), again) {

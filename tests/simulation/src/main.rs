@@ -18,7 +18,7 @@ fn main() -> ExitCode {
                 return ExitCode::FAILURE;
             }
         };
-        println!("{}", serde_json::to_string(&run(&options)).expect("what came of it as JSON"));
+        println!("{}", serde_json::to_string(&run(&options)).expect("the outcome as JSON"));
         return ExitCode::SUCCESS;
     }
     let program = std::env::current_exe().expect("the path of this program");

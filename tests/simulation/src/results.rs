@@ -45,7 +45,7 @@ pub fn model(task: &TaskInput, state: &State) -> Result<(Bytes, u32), TaskError>
     Ok((ply::to_bytes(&model, &water_comment(task)?)?.into(), n as u32))
 }
 
-/// A model has a water in its header only if partitions refine it.
+/// A model has a water in its header only if partitions train one.
 fn water_comment(task: &TaskInput) -> Result<Vec<String>, TaskError> {
     let agreed = match task.input(Artifact::Exchange) {
         Some(path) => Exchange::from_json(&read(path)?)?.water,

@@ -337,7 +337,7 @@ impl User {
             7..16 => self.want(job, "resume").await,
             16..18 if self.wanted().may_be_cancelled => self.want(job, "cancel").await,
             18..25 => self.want(job, "update").await,
-            25..40 => self.pry(random).await,
+            25..40 => self.probe_others(random).await,
             40..48 => self.operate(random).await,
             _ => Ok(()),
         }
@@ -373,7 +373,7 @@ impl User {
     }
 
     /// Tries to read the jobs of others.
-    async fn pry(&self, random: &mut Random) -> turmoil::Result {
+    async fn probe_others(&self, random: &mut Random) -> turmoil::Result {
         let others = self.world.created();
         let others: Vec<&JobId> = others
             .iter()

@@ -46,7 +46,7 @@ const FAULTS_FOR: Duration = Duration::from_secs(45);
 /// dead connection.
 const ENDS_WITHIN: Duration = Duration::from_secs(180);
 
-/// All stages of jobs.
+/// All kinds of jobs: the number of partitions, and the additional stages.
 pub const KINDS: [(u32, Variety); 6] = [
     (1, Variety::Plain),
     (2, Variety::Plain),

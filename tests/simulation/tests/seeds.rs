@@ -13,7 +13,7 @@ fn program() -> &'static Path {
 }
 
 #[test]
-fn invariants_hold_whatever_crashes_is_cut_or_comes_twice() {
+fn invariants_hold_despite_crashes_cuts_and_repeats() {
     let since = Instant::now();
     let seeds = 1..=setting("FATHOM_SIMULATION_SEEDS").unwrap_or(200);
     let counts = Campaign::new(program()).all(seeds).unwrap_or_else(|report| panic!("{report}"));

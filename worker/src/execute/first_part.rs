@@ -1,10 +1,10 @@
 //! FIRST_PART: the run of a partition up to the exchange, and its continuation by PARTITION.
 //!
-//! Both tasks are one run, which starts from the coarse model and its water. The first task submits its
-//! checkpoint. If partitions refine the water, it adds the water parameters and their evidence; if they end
-//! beside their neighbours, the Gaussians of its cell. The second task resumes from that checkpoint, with
-//! iteration and moments. It freezes the water at the consensus of all partitions, and trains its own cell
-//! alone, beside the Gaussians of its neighbours.
+//! Both tasks are parts of one run, which starts from the coarse model and its water. The first part submits
+//! its checkpoint. If partitions train the water jointly, it adds the water parameters and their evidence. If
+//! they end beside their neighbours, it adds the Gaussians of its cell. The second part resumes from that
+//! checkpoint, with iteration and moments. It freezes the water at the consensus of all partitions. If
+//! partitions end beside their neighbours, it trains its own cell alone, beside their Gaussians.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -63,7 +63,7 @@ pub fn run(
     Ok(TaskOutput { result, gaussians, resumed_from, held_out, further: Vec::new() })
 }
 
-/// Whether first tasks train the water; jobs with first tasks have more than one partition.
+/// Whether first parts train the water; jobs with first parts have more than one partition.
 fn refines_water(task: &TaskInput) -> bool {
     task.config.water.is_joint_for(2)
 }
@@ -88,7 +88,7 @@ fn rows_of(trained: Gaussians, cell: &FocusBox) -> Result<Option<Bytes>, TaskErr
     Ok(if own.is_empty() { None } else { Some(Bytes::from(ply::to_bytes(&own, &[])?)) })
 }
 
-/// The second task: the rest of the run, with the data that the partitions exchanged.
+/// The second part: the rest of the run, with the data that the partitions exchanged.
 pub fn run_rest(
     gpu: &Arc<Gpu>,
     task: &TaskInput,
@@ -121,7 +121,7 @@ pub fn run_rest(
     finish(task, &mut trainer, &own.config, &own.parts.shared, water, resumed_from, held_out)
 }
 
-/// Outcome of loading the first task's state.
+/// Outcome of loading the state of the first part.
 enum Restored {
     /// The run continues from it.
     Run(Box<Trainer>),
@@ -131,7 +131,7 @@ enum Restored {
     DoesNotFit,
 }
 
-/// The run as the first task left it, with the water `frozen`, and beside the neighbours if there are any.
+/// The run as the first part left it, with the water `frozen`, and beside the neighbours if there are any.
 fn restore(
     gpu: &Arc<Gpu>,
     task: &TaskInput,
@@ -174,7 +174,7 @@ fn restore(
     }
 }
 
-/// Context of the second task: the coarse model outside this partition's box, and the neighbours' Gaussians
+/// Context of the second part: the coarse model outside this partition's box, and the neighbours' Gaussians
 /// inside it. Farther away the coarse model stays, so no task holds more detail than its own box.
 fn context_of_neighbours(
     task: &TaskInput,
@@ -242,7 +242,7 @@ fn without_view_dependence(model: &mut Gaussians) {
 
 fn no_water() -> TaskError {
     let message =
-        "a partition that refines the water needs its box, and a coarse model with a water".to_owned();
+        "a partition that trains the water needs its box, and a coarse model with a water".to_owned();
     TaskError::Failed { class: FailClass::Input, message }
 }
 

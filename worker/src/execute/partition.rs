@@ -1,7 +1,7 @@
 //! PARTITION: trains the Gaussians in this partition's box; the rest of the coarse model is context.
 //!
 //! A job of one partition has no coarse model and trains everything from the sparse points. If partitions
-//! have two parts (`first_part.rs`), this is the second task of each.
+//! have two parts (`first_part.rs`), this is the second part.
 
 use std::sync::Arc;
 

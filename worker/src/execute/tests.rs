@@ -290,7 +290,7 @@ fn a_global_stage_reads_its_water_from_photographs_of_full_size() {
     assert_ne!(water(16, 16), full);
 }
 
-/// A coarse model with a water, and a partition that holds all of it; the first task ends at iteration 14
+/// A coarse model with a water, and a partition that holds all of it; the first part ends at iteration 14
 /// of 20.
 struct TwoTasks {
     dir: tempfile::TempDir,
@@ -335,7 +335,7 @@ impl TwoTasks {
         fathom_core::ply::water_record(self.task.input(Artifact::CoarseModel).unwrap()).unwrap().unwrap()
     }
 
-    /// The second task, with a consensus half as clear as the coarse water.
+    /// The second part, under a consensus that is half as clear as the coarse water.
     fn second(&self, state: Option<&[u8]>) -> (TaskInput, WaterRecord) {
         let mut water = self.coarse();
         water.beta_d = water.beta_d.map(|beta| 2.0 * beta);
@@ -382,13 +382,13 @@ fn a_first_part_trains_its_water_and_submits_the_evidence() {
 }
 
 #[test]
-fn a_second_part_resumes_under_the_consensus_water() {
+fn a_second_part_resumes_under_the_agreed_water() {
     let Some(executor) = executor("the second part of a partition", None) else { return };
     let two = TwoTasks::new(&executor);
     let (task, water) = two.second(Some(&two.state));
     let control = Keeps::new(None);
     let whole = executor.execute(&task, &control).unwrap();
-    assert_eq!(two.header(&whole.result), Some(water), "the header is not the consensus to the bit");
+    assert_eq!(two.header(&whole.result), Some(water), "the header differs from the consensus");
     let reported = control.reported.lock().unwrap().clone();
     assert!(reported.iter().all(|(done, of)| *of == 6 && *done <= 6), "{reported:?}");
     assert_eq!(reported.last(), Some(&(6, 6)));

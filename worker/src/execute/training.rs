@@ -305,7 +305,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_stretch_ends_where_a_measurement_is_due() {
+    fn a_span_ends_where_a_measurement_is_due() {
         assert_eq!([0, 1, 39, 40, 41].map(|iteration| until_measured(iteration, 40)), [40, 39, 1, 40, 39]);
         assert_eq!(until_measured(7, 0), u32::MAX, "never");
     }

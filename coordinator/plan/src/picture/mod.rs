@@ -298,7 +298,7 @@ fn counts(partition: &Partition) -> String {
     format!("{own} + {}", partition.chosen_views.len() - own)
 }
 
-/// Wipes what reaches beyond the map and frames it.
+/// Clears everything drawn outside the map, and frames the map.
 fn draw_frame(canvas: &mut Canvas, map: &Map) {
     let [left, top, right, bottom] = map.frame;
     let (width, height) = (WIDTH as f32, map.height as f32);

@@ -51,7 +51,7 @@ fn append(builder: &mut PathBuilder, path: &str, x: f32, y: f32, scale: f32) {
     }
 }
 
-/// Width and path of a character; what is not known is drawn as an empty box.
+/// Width and path of a character; unknown characters are drawn as an empty box.
 fn glyph(character: char) -> (f32, &'static str) {
     match character {
         ' ' => (1.6, ""),

@@ -57,7 +57,7 @@ fn one_partition_has_nothing_to_weigh() {
 }
 
 #[test]
-fn a_plan_says_when_weights_are_all_alike() {
+fn a_plan_warns_if_all_weights_are_equal() {
     let (views, points) = (survey(400), floor(4000));
     let warned = |columns: u32, clamp: f64, mode: WeightMode| {
         let mut config = config(columns, columns);

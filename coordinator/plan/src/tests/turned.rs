@@ -23,7 +23,7 @@ fn askew(degrees: f64) -> (Vec<TrainView>, Points) {
 }
 
 #[test]
-fn a_survey_that_lies_askew_is_cut_like_one_along_the_axes() {
+fn a_tilted_survey_is_cut_like_an_aligned_one() {
     let config = config(3, 1);
     let (views, points) = askew(0.0);
     let straight = planned(&views, &points, &config);
@@ -47,7 +47,7 @@ fn a_survey_that_lies_askew_is_cut_like_one_along_the_axes() {
 }
 
 #[test]
-fn nothing_turns_where_the_configuration_says_so() {
+fn the_configuration_can_disable_the_turn() {
     let (views, points) = askew(30.0);
     let mut config = config(3, 1);
     config.partition.rotate = false;

@@ -325,7 +325,7 @@ async fn marks_of_workers_are_kept_and_leases_name_their_holders(store: Arc<dyn 
     assert_eq!((&leased[0].0, leased[0].1.incarnation.as_str()), (&grant.lease, "worker-incarnation"));
 }
 
-async fn what_is_exported_is_whole_and_goes_on_in_another_store(store: Arc<dyn Store>) {
+async fn an_export_is_complete_and_continues_in_another_store(store: Arc<dyn Store>) {
     let store = store.as_ref();
     let id = planned_job(store, 1, 3).await;
     do_next(store, Stage::Global.task(), T0 + 20).await;
@@ -418,21 +418,21 @@ conformance!(
     budgets_end_a_poisoned_job,
     a_cancelled_job_gives_and_takes_nothing_more,
     progress_is_seen_and_belongs_to_the_lease,
-    partitions_resume_their_first_part_under_one_consensus,
-    borders_are_refined_before_evaluation_and_become_the_model,
-    a_phase_that_fails_for_good_ends_the_job,
-    a_paused_job_gives_nothing_out_and_takes_what_comes_in,
-    the_time_of_a_stage_is_without_pauses,
-    a_failed_job_goes_on_where_it_failed,
+    partitions_resume_their_first_part_after_one_exchange,
+    borders_are_trained_before_evaluation_and_change_the_model,
+    a_stage_that_fails_for_good_ends_the_job,
+    a_paused_job_assigns_nothing_and_accepts_results,
+    the_duration_of_a_stage_excludes_pauses,
+    a_retried_job_resumes_where_it_failed,
     a_deleted_job_is_gone_and_its_request_makes_no_other,
     the_job_with_higher_priority_goes_first_within_limits,
-    a_list_holds_what_its_filter_admits_page_by_page,
+    a_list_has_all_jobs_of_its_filter_page_by_page,
     a_task_goes_to_workers_with_enough_memory_and_raises_it,
     a_stalled_worker_loses_its_task_and_a_job_may_be_given_up,
-    what_is_exported_is_whole_and_goes_on_in_another_store,
+    an_export_is_complete_and_continues_in_another_store,
     marks_of_workers_are_kept_and_leases_name_their_holders,
     tenants_share_workers_but_not_requests_and_lists,
-    a_tenant_gets_no_more_than_it_may_have,
+    a_tenant_stays_within_its_quota,
     tokens_and_quotas_are_kept_and_travel_with_an_export,
     levels_follow_what_happens_to_jobs_tasks_and_leases,
     a_dataset_is_frozen_once_and_its_files_never_change,

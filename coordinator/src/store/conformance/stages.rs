@@ -2,7 +2,7 @@
 
 use super::*;
 
-pub async fn partitions_resume_their_first_part_under_one_consensus(store: Arc<dyn Store>) {
+pub async fn partitions_resume_their_first_part_after_one_exchange(store: Arc<dyn Store>) {
     let store = store.as_ref();
     let id = job_of(store, 1, planned_as(2, true)).await;
     assert_eq!(store.job(&id).await.unwrap().job.iterations_total, 500);
@@ -68,7 +68,7 @@ pub async fn partitions_resume_their_first_part_under_one_consensus(store: Arc<d
     assert_eq!(entered, [Stage::Global, Stage::FirstPart, Stage::Exchange, Stage::Partition, Stage::Merge]);
 }
 
-pub async fn borders_are_refined_before_evaluation_and_become_the_model(store: Arc<dyn Store>) {
+pub async fn borders_are_trained_before_evaluation_and_change_the_model(store: Arc<dyn Store>) {
     let store = store.as_ref();
     let borders = PlannedTask::new(blob("borders"), 30);
     let id = job_of(store, 1, planned_and(Stage::Borders.task(), borders)).await;
@@ -117,7 +117,7 @@ pub async fn borders_are_refined_before_evaluation_and_become_the_model(store: A
     );
 }
 
-pub async fn a_phase_that_fails_for_good_ends_the_job(store: Arc<dyn Store>) {
+pub async fn a_stage_that_fails_for_good_ends_the_job(store: Arc<dyn Store>) {
     let store = store.as_ref();
     let before = [
         Stage::Global.task(),

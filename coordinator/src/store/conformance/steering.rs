@@ -2,7 +2,7 @@
 
 use super::*;
 
-pub async fn a_paused_job_gives_nothing_out_and_takes_what_comes_in(store: Arc<dyn Store>) {
+pub async fn a_paused_job_assigns_nothing_and_accepts_results(store: Arc<dyn Store>) {
     let store = store.as_ref();
     let id = planned_job(store, 1, 3).await;
     do_next(store, Stage::Global.task(), T0 + 20).await;
@@ -43,7 +43,7 @@ pub async fn a_paused_job_gives_nothing_out_and_takes_what_comes_in(store: Arc<d
     }
 }
 
-pub async fn the_time_of_a_stage_is_without_pauses(store: Arc<dyn Store>) {
+pub async fn the_duration_of_a_stage_excludes_pauses(store: Arc<dyn Store>) {
     let store = store.as_ref();
     let steer = async |id: &JobId, event, now_ms| store.steer(id, event, now_ms).await.unwrap().job;
     let pause = || Event::Pause { reason: String::new() };
@@ -62,7 +62,7 @@ pub async fn the_time_of_a_stage_is_without_pauses(store: Arc<dyn Store>) {
     assert_eq!(store.job_row(&id).await.unwrap().stage_seconds[&Stage::Merge], 3.0);
 }
 
-pub async fn a_failed_job_goes_on_where_it_failed(store: Arc<dyn Store>) {
+pub async fn a_retried_job_resumes_where_it_failed(store: Arc<dyn Store>) {
     let store = store.as_ref();
     let id = planned_job(store, 1, 2).await;
     do_next(store, Stage::Global.task(), T0 + 20).await;
@@ -146,7 +146,7 @@ pub async fn the_job_with_higher_priority_goes_first_within_limits(store: Arc<dy
     );
 }
 
-pub async fn a_list_holds_what_its_filter_admits_page_by_page(store: Arc<dyn Store>) {
+pub async fn a_list_has_all_jobs_of_its_filter_page_by_page(store: Arc<dyn Store>) {
     let store = store.as_ref();
     let mut ids = Vec::new();
     for number in 0..25 {

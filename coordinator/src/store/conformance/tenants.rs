@@ -55,7 +55,7 @@ pub async fn tenants_share_workers_but_not_requests_and_lists(store: Arc<dyn Sto
     assert_eq!(store.claim(&own, T0 + 100).await.unwrap().unwrap().job.tenant, tenant("kelp"));
 }
 
-pub async fn a_tenant_gets_no_more_than_it_may_have(store: Arc<dyn Store>) {
+pub async fn a_tenant_stays_within_its_quota(store: Arc<dyn Store>) {
     let store = store.as_ref();
     let reef = tenant("reef");
     let quota = Quota { max_open_jobs: 2, max_parallel: 1, max_bytes: 0 };

@@ -118,7 +118,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_migration_changes_every_row_once_also_when_it_was_cut_off() {
+    async fn a_migration_changes_every_row_once_even_if_interrupted() {
         let dir = tempfile::tempdir().unwrap();
         let store = SledStore::open(&options(dir.path())).unwrap();
         for number in 0..3 {

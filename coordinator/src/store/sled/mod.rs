@@ -5,7 +5,7 @@
 //! | tree | key | row |
 //! |---|---|---|
 //! | `jobs` | job | [`JobRecord`] |
-//! | `tasks` | job, kind, index | [`TaskRecord`] |
+//! | `tasks` | job, stage, index | [`TaskRecord`] |
 //! | `events` | job, seq | [`StoredEvent`] |
 //! | `requests` | [`request_key`] | job |
 //! | `workers` | incarnation | [`WorkerMark`] |
@@ -396,7 +396,7 @@ impl Store for SledStore {
     async fn export(&self) -> Result<Export, StoreError> {
         let rows = self.all_rows()?;
         self.flusher.sync_what_was_read().await?;
-        let export = threads::blocking(move || rows.into_dump()).await;
+        let export = threads::blocking(move || rows.into_export()).await;
         export.map_err(|error| StoreError::Failed(error.to_string()))?
     }
 

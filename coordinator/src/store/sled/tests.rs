@@ -14,12 +14,12 @@ fn blob() -> BlobRef {
     BlobRef { digest: "0".repeat(64), bytes: 1 }
 }
 
-async fn claim(store: &SledStore, kind: Stage, request_id: &str) -> Option<Lease> {
+async fn claim(store: &SledStore, stage: Stage, request_id: &str) -> Option<Lease> {
     let (name, incarnation) = ("worker".into(), "incarnation".into());
     let worker = WorkerProfile {
         name,
         incarnation,
-        stages: vec![kind],
+        stages: vec![stage],
         methods: fathom_core::config::Method::ALL.to_vec(),
         memory_bytes: None,
         tenant: None,
@@ -37,7 +37,7 @@ fn planned(partitions: u32) -> TaskOutput {
 }
 
 #[test]
-fn a_directory_that_is_open_says_so_to_the_second_one() {
+fn a_second_opener_is_refused_with_the_reason() {
     let dir = tempfile::tempdir().unwrap();
     let options =
         SledOptions { dir: dir.path().to_owned(), rules: Rules::default(), lease_ms: 1000, stall_ms: 0 };
@@ -269,7 +269,7 @@ fn files_under(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
 }
 
 #[tokio::test]
-async fn who_only_looks_opens_a_copy_and_changes_no_byte() {
+async fn read_only_access_opens_a_copy_and_changes_no_byte() {
     let dir = tempfile::tempdir().unwrap();
     let scratch = tempfile::tempdir().unwrap();
     let options = options_in(&dir);

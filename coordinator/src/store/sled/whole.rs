@@ -131,7 +131,7 @@ impl AllRows {
     ///
     /// # Errors
     /// When a row cannot be read.
-    pub(super) fn into_dump(self) -> Result<Export, StoreError> {
+    pub(super) fn into_export(self) -> Result<Export, StoreError> {
         let mut export = Export::default();
         for (_, bytes) in &self.jobs {
             let job: JobRecord = decode("jobs", bytes)?;

@@ -200,9 +200,9 @@ fn a_damaged_border_is_repaired_and_nothing_else_changes() {
 }
 
 #[test]
-fn a_refinement_that_is_interrupted_gives_the_same_bytes() {
-    let Some(mut damaged) = Damaged::new("a refinement that is interrupted") else { return };
-    let executor = executor("a refinement that is interrupted", None).unwrap();
+fn interrupted_border_training_gives_the_same_bytes() {
+    let Some(mut damaged) = Damaged::new("interrupted border training") else { return };
+    let executor = executor("interrupted border training", None).unwrap();
     damaged.task.common.iterations = 40;
     damaged.task.config.borders.relocate = true;
     let whole = executor.execute(&damaged.task, &Keeps::new(None)).unwrap();
