@@ -32,7 +32,7 @@ fn main() -> Result<()> {
     Ok(())
 }
 
-/// "least, median ms; CPU ms" of `work`.
+/// Least and median wall time and CPU time of `work`, as text.
 fn times(mut work: impl FnMut() -> Result<()>) -> Result<String> {
     let cpu = cpu_time::cpu_seconds();
     let mut walls = Vec::with_capacity(REPEATS);

@@ -52,7 +52,7 @@ fn photographs(scene: &Scene, data: &DataConfig, held_out: bool) -> Fallible<InM
         if (index as u32).is_multiple_of(data.test_every) != held_out {
             continue;
         }
-        let camera = scene.camera(view.camera_id).ok_or("a view names a camera that is not there")?;
+        let camera = scene.camera(view.camera_id).ok_or("a view refers to a missing camera")?;
         let bytes = std::fs::read(view.image.as_ref().ok_or("a view has no photograph")?)?;
         let photograph = Photograph { name: &view.name, image: &bytes, mask: None };
         let (_, image) = prepare(&photograph, camera, data.mask_keep, data.max_resolution)?;

@@ -1,5 +1,5 @@
-//! Estimates the water of a scene from its photographs, without any training: for `make accept` and for a
-//! first look.
+//! Estimates the water of a scene from its photographs without training, for `make accept` and for a first
+//! look.
 //!
 //! `cargo run --example water_prior -- SCENE [--max-resolution PX] [--tracks BOOL] [--beyond-points BOOL]`;
 //! held-out views are not used. It prints one JSON object: the water parameters, their standard errors, and
@@ -70,7 +70,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         if data.test_every > 0 && index.is_multiple_of(data.test_every) {
             continue;
         }
-        let camera = scene.camera(view.camera_id).ok_or("a view names a camera that is not there")?;
+        let camera = scene.camera(view.camera_id).ok_or("a view refers to a missing camera")?;
         views.push(TrainView {
             name: view.name.clone(),
             camera: prepared_camera(camera, data.max_resolution)?,

@@ -19,7 +19,7 @@ use crate::{CoreError, Result};
 /// own, order w x y z.
 const COMMENT: &str = "fathom frame: scene_to_model_quat_wxyz ";
 
-/// The comment of a model whose axes are the scene's, turned by `rotation`.
+/// The header comment of a model whose axes are the scene's, rotated by `rotation`.
 pub fn comment(rotation: DQuat) -> String {
     let DQuat { x, y, z, w } = rotation;
     format!("{COMMENT}{w} {x} {y} {z}")
@@ -40,10 +40,10 @@ pub fn among(comments: &[String]) -> Result<Option<DQuat>> {
         return Ok(None);
     };
     let numbers: Vec<f64> = words.split_whitespace().filter_map(|word| word.parse().ok()).collect();
-    let refuse = || CoreError::Scene(format!("the frame in the model's header is no rotation: {words:?}"));
+    let refuse = || CoreError::Scene(format!("the frame in the model's header is not a rotation: {words:?}"));
     let [w, x, y, z] = <[f64; 4]>::try_from(numbers).map_err(|_| refuse())?;
     let rotation = DQuat::from_xyzw(x, y, z, w);
-    // Guarded positively, so that NaN fails.
+    // Phrased positively, so that NaN fails.
     let is_unit = (rotation.length() - 1.0).abs() < 1e-6;
     if is_unit { Ok(Some(rotation.normalize())) } else { Err(refuse()) }
 }

@@ -8,7 +8,7 @@ use std::path::PathBuf;
 /// Result with [`CoreError`].
 pub type Result<T, E = CoreError> = std::result::Result<T, E>;
 
-/// What can go wrong in the trainer and its readers.
+/// Errors of the trainer and its readers.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum CoreError {
@@ -45,7 +45,7 @@ pub enum CoreError {
         too_large(buffer, *needed_bytes, *limit_bytes)
     )]
     BufferTooLarge {
-        /// Which buffer.
+        /// Name of the buffer.
         buffer: &'static str,
         /// Bytes it needs.
         needed_bytes: u64,
@@ -66,9 +66,9 @@ pub enum CoreError {
         /// What refused which allocation.
         message: String,
     },
-    /// The device is gone: a driver that was reset or updated, a GPU that was unplugged or hung. Open
-    /// another.
-    #[error("the GPU was lost ({message}); what it was doing has to be done again")]
+    /// The device is lost: the driver was reset or updated, or the GPU was unplugged or hung. Open another
+    /// device.
+    #[error("the GPU was lost ({message}); the interrupted work must be repeated")]
     DeviceLost {
         /// The message of the driver.
         message: String,

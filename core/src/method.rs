@@ -52,7 +52,7 @@ pub trait Run {
     /// before each view, returns false.
     ///
     /// # Errors
-    /// When a photograph cannot be read, or the device cannot hold the model once more.
+    /// When a photograph cannot be read, or the device cannot hold a second copy of the model.
     fn measure(
         &mut self,
         held_out: &dyn ViewSource,

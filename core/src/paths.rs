@@ -17,9 +17,9 @@ pub fn check_inside(path: &str) -> Result<(), String> {
     } else if path.len() > MAX_PATH_BYTES {
         return Err(format!("has {} bytes, and at most {MAX_PATH_BYTES} are allowed", path.len()));
     } else if path.chars().any(char::is_control) {
-        "holds a control character"
+        "contains a control character"
     } else if path.contains('\\') {
-        "holds a backslash; parts are divided by /"
+        "contains a backslash; separate the parts with /"
     } else if path.starts_with('/') || path.split('/').any(has_drive) {
         "is absolute; it must be relative"
     } else if path.split('/').any(|part| part == "..") {

@@ -78,7 +78,7 @@ pub enum EndsOn {
     Edge = 3,
 }
 
-/// Where pixels come from: a cache on a worker, a folder, a test.
+/// Source of views and their pixels: a cache on a worker, a folder, a test.
 pub trait ViewSource: Send + Sync {
     /// All views, in the order that seeds refer to (sorted by name).
     fn views(&self) -> &[TrainView];
@@ -117,7 +117,7 @@ impl Weighted {
         let sound = |weight: &f32| *weight > 0.0 && weight.is_finite();
         if weights.len() != source.views().len() || !weights.iter().all(sound) {
             return Err(CoreError::Config(format!(
-                "{} weights, which must be finite and above 0, for {} views",
+                "{} weights for {} views; each view needs one finite weight above 0",
                 weights.len(),
                 source.views().len()
             )));
@@ -162,7 +162,7 @@ impl Mapped {
         };
         if maps.len() != source.views().len() || !maps.iter().all(sound) {
             return Err(CoreError::Config(format!(
-                "{} maps, each with as many cells as columns times rows, for {} views",
+                "{} maps for {} views; each view needs one with columns * rows cells",
                 maps.len(),
                 source.views().len()
             )));

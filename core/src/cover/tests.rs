@@ -32,7 +32,7 @@ fn points(positions: &[[f64; 3]]) -> Points {
     points
 }
 
-/// Points of tracks.
+/// Points with tracks.
 fn tracked(positions: &[([f64; 3], &[u32])]) -> Points {
     let mut points = Points::default();
     for (position, track) in positions {
@@ -46,7 +46,7 @@ fn grey(code: u8) -> PackedImage {
     PackedImage { width: SIDE, height: SIDE, pixels: vec![pixel; PIXELS] }
 }
 
-/// A picture whose mask holds where the column is one of these.
+/// A picture whose mask is set in these columns.
 fn masked(image: PackedImage, columns: std::ops::Range<usize>) -> PackedImage {
     let masked = |(index, pixel): (usize, u32)| {
         if columns.contains(&(index % 100)) { pixel } else { pixel & 0x00ff_ffff }
@@ -120,7 +120,7 @@ fn holes_are_covered_pixels_that_the_model_leaves_open() {
     let hole = |x, y| if (x, y) == (30, 50) || x > 90 { 0.89 } else { 0.95 };
     let shown = Shown::wall(hole);
     assert_eq!(shown.measured(&views, &points).holes, Some(1.0 / 6.0), "one of six covered pixels");
-    // NaN is no surface.
+    // NaN does not count as a surface.
     let broken = Shown { alpha: vec![f32::NAN; PIXELS], ..shown };
     assert_eq!(broken.measured(&views, &points).holes, Some(1.0));
 }
@@ -138,7 +138,7 @@ fn a_point_that_only_one_training_view_sees_covers_nothing() {
 }
 
 #[test]
-fn a_place_that_fewer_than_two_training_views_show_is_unseen() {
+fn positions_in_fewer_than_two_training_views_are_unseen() {
     let wall = Shown::wall(|x, _| if x < 20 { 0.5 } else { 1.0 });
     let unseen = |training: &[f64]| wall.measured(&views(training), &Points::default()).unseen;
     // The picture from x = 3 begins at pixel 30 of the held-out view; 20 columns are no surface.
@@ -151,7 +151,7 @@ fn a_place_that_fewer_than_two_training_views_show_is_unseen() {
 }
 
 #[test]
-fn a_camera_that_looks_away_sees_nothing_of_what_is_behind_it() {
+fn a_camera_sees_nothing_behind_it() {
     let mut views = views(&[0.0, 0.0]);
     views[2].1 = Pose::looking_at(DVec3::ZERO, -DVec3::Z, DVec3::Y);
     let wall = Shown::wall(|_, _| 1.0);
@@ -164,7 +164,7 @@ fn light_left_in_open_water_is_a_share_of_the_white_of_j() {
     let mut shown = Shown::wall(|x, _| if x < 40 { 0.1 } else { 1.0 });
     assert_eq!(shown.measured(&views, &Points::default()).open_water, None, "no medium");
     let mut clear = grey(200);
-    // Half a percent of highlights is no white; open water is dim.
+    // Half a percent of highlights must not count as white; open water is dim.
     for (pixel, value) in clear.pixels.iter_mut().enumerate() {
         match (pixel % 100, pixel / 100) {
             (..40, _) => *value = u32::from_le_bytes([0, 0, 100, 255]),
@@ -268,7 +268,7 @@ fn sparse_points_predict_what_will_be_unseen() {
 }
 
 #[test]
-fn a_grid_is_even_and_has_a_bound_whatever_the_picture() {
+fn a_grid_is_even_and_bounded_for_any_picture() {
     for (width, height) in [(1, 1), (64, 64), (65, 64), (1600, 1200), (65_535, 1), (3, 65_535), (4096, 4096)]
     {
         let camera = camera().resized(width, height);

@@ -49,7 +49,7 @@ pub fn dimensions(path: &Path) -> Result<(u32, u32)> {
     dimensions_of(&mut file).map_err(|message| CoreError::input(path, message))
 }
 
-/// As [`dimensions`], and makes sure that a JPEG is not cut off before its end marker.
+/// As [`dimensions`], and checks that a JPEG has its end marker.
 ///
 /// # Errors
 /// As [`dimensions`], and when the JPEG is truncated.
@@ -75,7 +75,7 @@ pub fn dimensions_of_complete(path: &Path) -> Result<(u32, u32)> {
     Ok(size)
 }
 
-/// Columns and rows; the message says what is wrong without naming the file.
+/// Columns and rows; the error message does not name the file.
 pub(super) fn dimensions_of<R: Read + Seek>(file: &mut R) -> Result<(u32, u32), String> {
     let unreadable = |error: std::io::Error| {
         if error.kind() == std::io::ErrorKind::UnexpectedEof {

@@ -91,7 +91,7 @@ impl PackedImage {
         Self { width, height, pixels }
     }
 
-    /// 8-bit RGB, three bytes a pixel; masked pixels as they are stored.
+    /// 8-bit RGB, three bytes a pixel; masked pixels keep their stored colour.
     pub fn to_rgb8(&self) -> Vec<u8> {
         self.pixels
             .iter()
@@ -112,7 +112,7 @@ impl PackedImage {
 /// A PNG of 8-bit RGB pixels, three bytes each.
 ///
 /// # Errors
-/// When `rgb` is not of the size that `width` and `height` say.
+/// When `rgb` does not have `width * height * 3` bytes.
 pub fn encode_png(width: u32, height: u32, rgb: &[u8]) -> Result<Vec<u8>> {
     encode(width, height, rgb, image::ExtendedColorType::Rgb8)
 }
@@ -120,7 +120,7 @@ pub fn encode_png(width: u32, height: u32, rgb: &[u8]) -> Result<Vec<u8>> {
 /// A PNG of 8-bit grey pixels, one byte each.
 ///
 /// # Errors
-/// When `grey` is not of the size that `width` and `height` say.
+/// When `grey` does not have `width * height` bytes.
 pub fn encode_grey_png(width: u32, height: u32, grey: &[u8]) -> Result<Vec<u8>> {
     encode(width, height, grey, image::ExtendedColorType::L8)
 }

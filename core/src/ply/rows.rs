@@ -57,7 +57,7 @@ mod tests {
 
     #[test]
     fn the_named_rows_change_and_no_other_byte() {
-        let comments = ["what else is said".to_owned()];
+        let comments = ["another comment".to_owned()];
         let before = to_bytes(&model(5, 1.0), &comments).unwrap();
         let mut after = before.clone();
         replace_rows(&mut after, "model", &[1, 4], &model(2, 50.0)).unwrap();

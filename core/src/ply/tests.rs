@@ -194,14 +194,14 @@ fn text_and_the_other_byte_order_give_the_same_model() {
             out.extend_from_slice(format!("{}\r\n", words.join(" ")).as_bytes());
         });
         assert_eq!(from_bytes(&text, "m").unwrap(), model, "text, degree {sh_degree}");
-        // The last line may have no end.
+        // The last line may lack its line end.
         assert_eq!(from_bytes(&text[..text.len() - 2], "m").unwrap(), model);
         assert!(message(&big[..big.len() - 1]).contains("inside Gaussian 4"));
     }
 }
 
 #[test]
-fn lines_that_are_no_gaussian_are_refused_by_number() {
+fn invalid_rows_are_refused_by_number() {
     let bytes = to_bytes(&sample(2, 0), &[]).unwrap();
     let text = reformatted(&bytes, "ascii", |row, out| {
         out.extend_from_slice("1 ".repeat(row.len()).as_bytes());
@@ -223,7 +223,7 @@ fn lines_that_are_no_gaussian_are_refused_by_number() {
 }
 
 #[test]
-fn other_formats_of_gaussians_are_named_with_what_converts_them() {
+fn other_formats_are_named_with_a_converter() {
     for name in ["a.splat", "b.SPZ", "dir.x/c.ksplat", "d.sog"] {
         let refused = from_bytes(&[0x1F, 0x8B, 8, 0], name).unwrap_err().to_string();
         let format = name.rsplit('.').next().unwrap().to_lowercase();

@@ -230,7 +230,7 @@ fn find_masks(draft: &mut Draft, views: &mut [View]) -> Result<()> {
         ));
     } else if !without.is_empty() {
         draft.warnings.push(format!(
-            "{}: {} of {} images have no mask and count whole: {}",
+            "{}: {} of {} images have no mask, so all their pixels count: {}",
             folder.display(),
             without.len(),
             views.len(),

@@ -178,7 +178,7 @@ pub struct PinholeCamera {
 }
 
 impl PinholeCamera {
-    /// The unit direction in which the middle of pixel `index` looks (row-major), camera frame.
+    /// Unit direction through the middle of pixel `index` (row-major), camera frame.
     pub fn direction(&self, index: usize) -> DVec3 {
         let width = self.width as usize;
         let (x, y) = ((index % width) as f64 + 0.5, (index / width) as f64 + 0.5);
@@ -290,7 +290,7 @@ mod tests {
             let other = camera.reshaped(width, height);
             assert_eq!((other.width, other.height), (width, height));
             assert_eq!((other.fx, other.fy), (80.0 * scale, 82.0 * scale), "{width}x{height}");
-            // Where the corners of the old picture lie in the new one: inside, in its middle.
+            // The old picture must be centred inside the new one.
             let left = other.cx - camera.cx * scale;
             let top = other.cy - camera.cy * scale;
             assert!(left >= 0.0 && top >= 0.0, "{other:?}");

@@ -16,7 +16,7 @@ pub(super) struct DistinctCameras {
 impl DistinctCameras {
     /// The id of a camera. A new camera is checked; its own id is ignored.
     pub fn id_of(&mut self, camera: Camera) -> Result<u32, String> {
-        // -0 is 0 here.
+        // -0 and 0 are equal here.
         let bits = camera.params.iter().map(|value| (value + 0.0).to_bits()).collect();
         let key = (camera.model, camera.width, camera.height, bits);
         if let Some(id) = self.ids.get(&key) {

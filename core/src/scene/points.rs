@@ -6,8 +6,8 @@
 //! 8         u64       N, the number of points
 //! 16        u64       M, the number of observations
 //! 24        N times   f32 x, f32 y, f32 z, u8 r, u8 g, u8 b    (15 bytes)
-//! 24 + 15N  N times   u32, how many views saw the point; M together
-//! 24 + 19N  M times   u32 view, index among the views of the scene by name; ascending by point, none twice
+//! 24 + 15N  N times   u32, number of views that see the point; M in total
+//! 24 + 19N  M times   u32 view, index among the views of the scene by name; ascending and unique for each point
 //! ```
 //! and for points without tracks (any version of Fathom reads this):
 //! ```text
@@ -160,7 +160,7 @@ impl Points {
                 track.extend(own.chunks_exact(4).map(|view| word(view, 0)));
                 views = rest;
                 if !track.is_sorted_by(|a, b| a < b) {
-                    return Err(refuse(format!("the views that saw point {index} are not ascending")));
+                    return Err(refuse(format!("the views that see point {index} are not ascending")));
                 }
             }
             if !points.push_seen(position.map(f64::from), [entry[12], entry[13], entry[14]], &mut track) {
@@ -177,7 +177,7 @@ impl Points {
 
 /// 1.1 times the largest distance of a centre from their mean: the extent that 3DGS scales learning rates by.
 ///
-/// 0 for one centre or none, so nothing may be divided by it.
+/// It is 0 for at most one centre, so do not divide by it.
 pub fn extent(centres: &[DVec3]) -> f64 {
     let mean = centres.iter().sum::<DVec3>() / (centres.len().max(1)) as f64;
     1.1 * centres.iter().map(|centre| centre.distance(mean)).fold(0.0, f64::max)

@@ -59,7 +59,7 @@ impl Shot {
             let (x, y) = (f64::from(index % WIDTH) + 0.5, f64::from(index / WIDTH) + 0.5);
             let ray = DVec3::new((x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, 1.0).normalize();
             let ray = pose.rotation.inverse() * ray;
-            // y = y0 + slope x along the ray, in the half space where the hit lies.
+            // y = y0 + slope x along the ray, in the half plane of the hit.
             let hit = |side: usize| {
                 let (y0, slope) = (ground.y[side], ground.slope[side]);
                 let t = (y0 + slope * eye.x - eye.y) / (ray.y - slope * ray.x);
@@ -83,10 +83,10 @@ impl Shot {
         SeenView { camera: &self.camera, pose: &self.pose, alpha: &self.alpha, range: &self.range }
     }
 
-    /// x on the ground of a pixel of a shot from above.
+    /// Ground x of a pixel in a shot from above.
     fn x(&self, index: usize) -> f64 {
         let column = (index % WIDTH as usize) as f64 + 0.5;
-        // The picture's y points to +z, so its x points to -x or +x: by the pose.
+        // The picture's y points to +z, so its x points to -x or +x, depending on the pose.
         let right = self.pose.rotation.inverse() * DVec3::X;
         self.pose.centre().x + right.x * (column - self.camera.cx) / self.camera.fx * DISTANCE
     }
@@ -211,7 +211,7 @@ fn a_pixel_belongs_to_the_border_by_where_its_surface_lies() {
 }
 
 #[test]
-fn lines_stand_in_the_aligned_frame_and_end_where_cells_end() {
+fn lines_are_in_the_aligned_frame_and_end_with_their_cells() {
     // A quarter turn about y maps world z to aligned x: the border runs along world x, for aligned z up to 1.
     let half = std::f64::consts::FRAC_1_SQRT_2;
     let lines = SeamLines {
@@ -284,7 +284,7 @@ fn views_that_see_no_border_or_hardly_any_do_not_count() {
     let seen = report.views[2].border_pixels;
     assert!(seen > 0 && seen < u64::from(WIDTH * HEIGHT) / 20, "{seen}");
     assert_eq!((report.views[1].border_psnr, report.views[2].border_psnr), (None, None));
-    assert!(report.border.pooled_psnr.unwrap() < db(5.0), "all pixels count in what is pooled");
+    assert!(report.border.pooled_psnr.unwrap() < db(5.0), "all pixels count in the pooled value");
 }
 
 /// The report of the same ground seen from straight above and from the side.
@@ -321,7 +321,7 @@ fn slopes_are_no_steps() {
         let median = report.range_step.border.median.unwrap();
         assert!(median < 2e-6, "slope {slope}: {median}");
     }
-    // Nor is an edge, where two slopes meet at the same height.
+    // An edge where two slopes meet at the same height is no step either.
     let report = steps_of(Ground { slope: [0.3, -0.2], ..FLAT });
     assert!(report.range_step.border.median.unwrap() < 0.01, "{report:?}");
 }
@@ -359,7 +359,7 @@ fn a_report_goes_into_the_metrics_and_into_each_view() {
     add(&mut meter, &Shot::above(0.0, FLAT), |_| 5);
     let report = meter.report();
     let again: SeamReport = serde_json::from_str(&serde_json::to_string(&report).unwrap()).unwrap();
-    assert_eq!(again, report, "it travels as JSON");
+    assert_eq!(again, report, "it survives JSON");
 
     let views = || json!([{ "name": "a", "psnr": 1.0 }, { "name": "b", "psnr": 2.0 }]);
     let mut metrics = json!({ "views": views() });

@@ -21,8 +21,8 @@
 //! The forward look adds two maps of the held-out views, 8-bit grey:
 //! - `truth/alpha/vNNNN.png`: share of the pixel's rays that meet a surface, 255 for all, 0 for none, which
 //!   is open water;
-//! - `truth/kind/vNNNN.png`: kind of surface that the rays meet. 0 means none, 2 that all meet a dark bluish
-//!   one, whose J is close to the colour of open water, 3 that all meet one with constant J, and 1 anything
+//! - `truth/kind/vNNNN.png`: kind of surface that the rays meet. 0 means none; 2 that all meet a dark bluish
+//!   one, with J close to the colour of open water. 3 means that all meet one with constant J, and 1 anything
 //!   else.
 //!
 //! `truth/water.json` has `by_direction`, with the fields of [`ByDirection`], if the colour of open water

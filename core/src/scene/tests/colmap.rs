@@ -103,7 +103,7 @@ fn rigs_and_frames_of_new_models_are_ignored() {
 }
 
 #[test]
-fn all_18_camera_models_keep_the_place_in_the_file() {
+fn all_18_camera_models_have_their_number_of_parameters() {
     // Numbers of parameters in sensor/models.h of COLMAP 4.1, in the order of the ids.
     let counts = [3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16, 4, 5, 3, 4, 6, 2];
     let mut model = Model::sample();
@@ -536,7 +536,7 @@ fn no_damaged_byte_makes_a_reader_panic() {
 }
 
 #[test]
-fn coordinates_that_f32_cannot_resolve_are_warned_of() {
+fn coordinates_that_f32_cannot_resolve_give_a_warning() {
     let mut model = Model::sample();
     for image in &mut model.images {
         // UTM: centres millions of units from the origin, a few units apart.
