@@ -1,5 +1,5 @@
-//! Lists the shaders, so that a new one is a new file: `shaders/*.wgsl` are kernels, `shaders/shared/*.wgsl`
-//! are imports.
+//! Lists the shaders, so that adding one only takes a new file: `shaders/*.wgsl` are kernels,
+//! `shaders/shared/*.wgsl` are imports.
 
 use std::error::Error;
 use std::fmt::Write;

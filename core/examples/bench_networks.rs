@@ -1,7 +1,8 @@
-//! Times of the networks on this machine: `cargo run --release -p fathom-core --example bench_networks`.
+//! Measures the networks on this machine: `cargo run --release -p fathom-core --example bench_networks`.
 //!
-//! For WaterParamPredict at each width: weights, and milliseconds of a prediction and of a training step at
-//! 64 x 96, by the wall clock (least and median) and of CPU time, which compares on a busy machine too.
+//! For WaterParamPredict at each width it prints the number of weights, and the milliseconds of a prediction
+//! and of a training step at 64 x 96. Times are wall time (least and median) and CPU time, which is
+//! comparable on a busy machine too.
 
 #[path = "shared/cpu_time.rs"]
 mod cpu_time;
@@ -22,7 +23,7 @@ fn main() -> Result<()> {
     let depth = DepthMap::new(width, height, values.collect())?;
     for channels in [8, 16, 32, 64] {
         let mut net = WaterParamNet::new(channels, RELEASE_PRIOR.to_raw(1.0), 1)?;
-        // Once without a clock: the first pass starts threads and touches memory.
+        // The first pass starts threads and touches memory, so it is not measured.
         net.learn(&depth, [0.1; 9], 1e-4, true)?;
         let predict = times(|| net.predict(&depth).map(drop))?;
         let step = times(|| net.learn(&depth, [0.1; 9], 1e-4, true).map(drop))?;
@@ -31,7 +32,7 @@ fn main() -> Result<()> {
     Ok(())
 }
 
-/// "least, median ms; CPU ms" of `work`.
+/// Least and median wall time and CPU time of `work`, as text.
 fn times(mut work: impl FnMut() -> Result<()>) -> Result<String> {
     let cpu = cpu_time::cpu_seconds();
     let mut walls = Vec::with_capacity(REPEATS);

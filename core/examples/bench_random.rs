@@ -1,15 +1,16 @@
-//! Times of the kernels in a training step over random Gaussians, and of the sort and the scan alone: for
+//! Measures the kernels of a training step over random Gaussians, and the sort and the scan alone, for
 //! `make bench`.
 //!
 //! `cargo run --release --example bench_random -- [GAUSSIANS] [WIDTH HEIGHT] [--repeats N] [--entries N,N]`:
-//! the scene of `shared/random_scene.rs`; without arguments 30,000 Gaussians at 480x270 on a CPU adapter,
-//! 1,000,000 at 1920x1080 on a GPU. A step is forward, backward with a constant gradient by the picture in
-//! place of a loss, and Adam with rates so small that every repetition has the same work.
+//! the scene is that of `shared/random_scene.rs`. Without arguments it has 30,000 Gaussians at 480x270 on a
+//! CPU adapter, 1,000,000 at 1920x1080 on a GPU. A step is forward, backward with a constant gradient of the
+//! picture instead of a loss, and Adam. The learning rates are so small that every repetition has the same
+//! work.
 //!
-//! One JSON object comes out. Times are medians over the repetitions, seconds: by the device's timestamps
-//! (`seconds`), and on a CPU adapter of CPU time (`cpu_seconds`), for which each stage runs alone; `passes`
-//! are whole submissions. Bytes are those of the lists that a stage reads and writes, each entry once; null
-//! where that is not simple.
+//! It prints one JSON object. Times are medians over the repetitions in seconds. `seconds` are the device's
+//! timestamps; `cpu_seconds` are CPU time on a CPU adapter, where each stage runs alone. `passes` are whole
+//! submissions. Bytes are those of the lists that a stage reads and writes, each entry once; null if there is
+//! no simple count.
 
 use std::error::Error;
 use std::sync::Arc;
@@ -37,7 +38,8 @@ use primitives::{KEY_BITS, Primitive, Primitives};
 
 type Fallible<T> = Result<T, Box<dyn Error>>;
 
-/// Of what is printed: `scripts/bench.sh` compares commits of one format only, and reads it from this line.
+/// Format of the output. `scripts/bench.sh` only compares commits of the same format, and reads it from this
+/// line.
 const FORMAT: u32 = 1;
 
 struct Arguments {
@@ -64,9 +66,8 @@ fn arguments(is_cpu: bool) -> Fallible<Arguments> {
         match word.as_str() {
             "--repeats" => found.repeats = value()?.parse()?,
             "--entries" => found.entries = value()?.split(',').map(str::parse).collect::<Result<_, _>>()?,
-            number => {
-                numbers.push(number.parse().map_err(|_| format!("{number} is no number and no option"))?)
-            }
+            number => numbers
+                .push(number.parse().map_err(|_| format!("{number} is neither a number nor an option"))?),
         }
     }
     match numbers[..] {
@@ -178,7 +179,7 @@ impl Step {
         Ok(record_backward(&self.gpu, recorder, &self.frame, &self.blocks, &self.view, buffers)?)
     }
 
-    /// Runs both passes, each as a submission; wall and CPU seconds of each.
+    /// Runs both passes, each as one submission, and returns their wall and CPU seconds.
     fn run(&self) -> Fallible<[(f64, f64); 2]> {
         let mut taken = [(0.0, 0.0); 2];
         for (pass, taken) in [Pass::Forward, Pass::Backward].into_iter().zip(&mut taken) {
@@ -192,13 +193,13 @@ impl Step {
         Ok(taken)
     }
 
-    /// Bytes of the lists that a stage reads and writes, each entry once; `None` where that is not simple.
+    /// Bytes of the lists that a stage reads and writes, each entry once; `None` if there is no simple count.
     fn bytes(&self, stage: &str, work: &Workload) -> Option<u64> {
         let (v, i) = (u64::from(work.visible), u64::from(work.intersections));
         let n = u64::from(self.blocks.total());
         let pixels = u64::from(self.view.size[0]) * u64::from(self.view.size[1]);
         let tiles = u64::from(self.view.tile_count());
-        // Intersections that rasterisation fetches: the slot, its Gaussian, and the splat of 48 bytes.
+        // For each intersection, rasterisation fetches the slot, its Gaussian, and the splat of 48 bytes.
         let fetched = work.needed_evaluations / u64::from(self.gpu.tile()).pow(2) * 56;
         let stride = sh_stride(self.blocks.sh_degree());
         let harmonics = 16 * u64::from(stride);
@@ -246,7 +247,7 @@ fn collect(all: &mut Vec<KernelTimes>, pass: Pass, times: Vec<KernelTime>, by_cp
     }
 }
 
-/// CPU seconds that a submission takes that does next to nothing: part of what each dispatch takes alone.
+/// CPU seconds of a nearly empty submission, which are part of the time of each dispatch that runs alone.
 fn submission_cpu_seconds(gpu: &Gpu) -> Fallible<Option<f64>> {
     let nothing = gpu.buffer("nothing", 16)?;
     let mut taken = Vec::new();
@@ -261,7 +262,7 @@ fn submission_cpu_seconds(gpu: &Gpu) -> Fallible<Option<f64>> {
     Ok(median(&taken))
 }
 
-/// `None` of nothing.
+/// The median; `None` without values.
 fn median(times: &[f64]) -> Option<f64> {
     let mut sorted = times.to_vec();
     sorted.sort_by(f64::total_cmp);
@@ -278,7 +279,7 @@ fn digest<T: bytemuck::Pod>(values: &[T]) -> String {
     blake3::hash(bytemuck::cast_slice(values)).to_hex()[..32].to_owned()
 }
 
-/// The object of one stage or primitive: its times, bytes, and on a GPU bandwidth.
+/// The object of one stage or primitive: its times, its bytes and, on a GPU, its bandwidth.
 fn times_of(
     gpu: &Gpu,
     seconds: &[f64],
@@ -312,7 +313,7 @@ fn measure_primitives(gpu: &Gpu, arguments: &Arguments) -> Fallible<Vec<Value>> 
                 gpu.wait()?;
                 let taken = cpu_seconds() - before;
                 if repeat == 0 {
-                    // Compiled now.
+                    // The first repetition compiles the kernels.
                     primitives.check(primitive)?;
                     continue;
                 }
@@ -341,7 +342,7 @@ fn main() -> Fallible<()> {
     let is_cpu = gpu.adapter().is_cpu;
     let arguments = arguments(is_cpu)?;
     let step = Step::new(&gpu, &arguments)?;
-    // Compiles what is left.
+    // Compiles the other kernels.
     step.run()?;
     let work = step.frame.workload(&gpu, &step.view)?;
     let pixels = arguments.width as usize * arguments.height as usize;

@@ -1,9 +1,8 @@
-//! Trains a few steps on more Gaussians than a binding holds, with one view that sees all of them and one
-//! that sees 2 %.
+//! Trains a few steps on more Gaussians than a binding holds. One view sees all of them, the other 2 %.
 //!
 //! `cargo run --release --example train_random -- [GAUSSIANS] [STEPS] [WIDTH HEIGHT]` (12 million, 6, 480
-//! 270). The scene is that of `shared/random_scene.rs`, the photographs are grey. Says what each step took
-//! and what lies on the device.
+//! 270). The scene is that of `shared/random_scene.rs`; the photographs are grey. It prints the time of each
+//! step and the memory on the device.
 
 use std::error::Error;
 use std::sync::Arc;
@@ -27,7 +26,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let or = |i: usize, default: u32| arguments.get(i).copied().unwrap_or(default);
     let (gaussians, steps, width, height) = (or(0, 12_000_000), or(1, 6), or(2, 480), or(3, 270));
     let (wide, pose) = random_scene::camera(width, height);
-    // A seventh of the angle both ways sees a fiftieth.
+    // A seventh of the angle in both directions shows a fiftieth.
     let narrow = PinholeCamera { fx: 7.0 * wide.fx, fy: 7.0 * wide.fy, ..wide };
     let view = |name: &str, camera| TrainView { name: name.to_owned(), camera, pose, clear_range: 0.0 };
     let views = grey(vec![view("all", wide), view("a fiftieth", narrow)]);

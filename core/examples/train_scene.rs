@@ -1,12 +1,16 @@
-//! Trains a scene on this machine's adapter without any service, and says what it cost: for `make bench`.
+//! Trains a scene on this machine's adapter without any service and reports the cost, for `make bench`.
 //!
 //! `cargo run --example train_scene -- SCENE [--iterations N] [--max-gaussians N] [--max-resolution PX]
-//! [--KEY VALUE]...` where KEY is any field of `TrainConfig`. `--evaluate-every N` measures held-out views on
-//! the way and `--time-every N` prints the device time of each stage then; `--initial-points N` starts from
-//! so many of the scene's points, `--model PATH` keeps the model, and `--water.KEY VALUE` sets any field of
-//! `WaterConfig` (`--water.priors.KEY` of those inside; its `medium` is `none` here unless set); where the
-//! scene has `truth/`, the water and J are compared with it; and `--shader-checks BOOL` says whether shaders
-//! check indices and loops (default: in debug builds). One JSON object comes out at the end.
+//! [--KEY VALUE]...` where KEY is any field of `TrainConfig`. Further options:
+//! - `--evaluate-every N` measures held-out views during the run;
+//! - `--time-every N` prints the device time of each stage during the run;
+//! - `--initial-points N` starts from this many of the scene's points;
+//! - `--model PATH` writes the model;
+//! - `--water.KEY VALUE` sets any field of `WaterConfig`, `--water.priors.KEY` one inside it; `medium` is
+//!   `none` by default;
+//! - `--shader-checks BOOL` makes shaders check indices and loops (default: in debug builds).
+//!
+//! If the scene has `truth/`, J is compared with it. At the end it prints one JSON object.
 
 use std::error::Error;
 use std::path::PathBuf;
@@ -37,18 +41,18 @@ mod floor;
 
 type Fallible<T> = Result<T, Box<dyn Error>>;
 
-/// Iterations at the end of the run whose stages are timed; they are timed one by one, so the means over the
-/// run do not count them.
+/// Iterations at the end of the run whose stages are timed. They run one by one, so the means over the run
+/// exclude them.
 const TIMED: u32 = 12;
 
-/// Those photographs of a scene that are held out, or the others.
+/// The held-out photographs of a scene, or the others.
 fn photographs(scene: &Scene, data: &DataConfig, held_out: bool) -> Fallible<InMemory> {
     let (mut views, mut images) = (Vec::new(), Vec::new());
     for (index, view) in scene.views.iter().enumerate() {
         if (index as u32).is_multiple_of(data.test_every) != held_out {
             continue;
         }
-        let camera = scene.camera(view.camera_id).ok_or("a view names a camera that is not there")?;
+        let camera = scene.camera(view.camera_id).ok_or("a view refers to a missing camera")?;
         let bytes = std::fs::read(view.image.as_ref().ok_or("a view has no photograph")?)?;
         let photograph = Photograph { name: &view.name, image: &bytes, mask: None };
         let (_, image) = prepare(&photograph, camera, data.mask_keep, data.max_resolution)?;
@@ -143,7 +147,7 @@ fn add(times: &mut Vec<KernelTime>, more: Vec<KernelTime>) {
     }
 }
 
-/// Keeps so many points, chosen by the seed, in their order.
+/// Keeps `count` points, chosen by the seed, in their order.
 fn thin(points: &mut Points, count: u32, seed: u32) {
     let all = points.positions.len();
     let mut kept = permutation(seed, Stream::Test, 0, all);
@@ -152,7 +156,7 @@ fn thin(points: &mut Points, count: u32, seed: u32) {
     *points = points.select(&kept);
 }
 
-/// What `fathom inspect` would forecast for this adapter.
+/// The forecast of `fathom inspect` for this adapter.
 fn forecast(gpu: &Gpu, run: &TrainRun, points: &Points) -> MemoryForecast {
     let points: Vec<DVec3> = points.positions.iter().map(|point| DVec3::from(point.map(f64::from))).collect();
     let views = run.views.views();
@@ -173,7 +177,7 @@ fn forecast(gpu: &Gpu, run: &TrainRun, points: &Points) -> MemoryForecast {
     size.forecast()
 }
 
-/// A picture of the truth; `None` where there is none.
+/// A picture of the ground truth; `None` if there is none.
 fn truth_picture(folder: &std::path::Path, part: &str, name: &str) -> Option<PackedImage> {
     let stem = folder.join("truth").join(part).join(name);
     let path = [stem.clone(), stem.with_extension("png")].into_iter().find(|path| path.is_file())?;
@@ -182,8 +186,8 @@ fn truth_picture(folder: &std::path::Path, part: &str, name: &str) -> Option<Pac
     Some(PackedImage { width: picture.width(), height: picture.height(), pixels })
 }
 
-/// PSNR of J where the truth is valid: rendered without the water, and the baked model as any viewer shows it
-/// against that.
+/// Mean PSNR of J where the truth is valid, rendered without the water, and of the model in a plain viewer
+/// against that render.
 fn clear_quality(
     gpu: &Arc<Gpu>,
     model: &Gaussians,
@@ -322,7 +326,7 @@ fn main() -> Fallible<()> {
             record.iter().map(|record| record.to_comment()).collect::<Result<_, _>>()?;
         write_model(path, &model, &comments)?;
     }
-    // Before the renderer of the evaluation comes on top.
+    // Before the renderer of the evaluation adds its memory.
     let device = gpu.memory();
     let (psnr, ssim) = evaluate(&gpu, &model, config.mip_filter, trainer.water_view()?, &test)?;
     let memory = trainer.memory();

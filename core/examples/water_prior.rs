@@ -1,9 +1,9 @@
-//! Estimates the water of a scene from its photographs, without any training: for `make accept` and for a
-//! first look.
+//! Estimates the water of a scene from its photographs without training, for `make accept` and for a first
+//! look.
 //!
 //! `cargo run --example water_prior -- SCENE [--max-resolution PX] [--tracks BOOL] [--beyond-points BOOL]`;
-//! held-out views are not looked at. One JSON object comes out: the nine numbers, their standard errors, and
-//! the truth where SCENE has `truth/water.json`.
+//! held-out views are not used. It prints one JSON object: the water parameters, their standard errors, and
+//! the ground truth if SCENE has `truth/water.json`.
 
 use std::error::Error;
 use std::path::PathBuf;
@@ -18,7 +18,7 @@ use fathom_core::water::water_prior;
 use fathom_core::{CoreError, Result};
 use serde_json::{Value, json};
 
-/// Photographs in a folder, read when they are asked for.
+/// Photographs in a folder, read on demand.
 struct Folder {
     views: Vec<TrainView>,
     files: Vec<(View, Camera)>,
@@ -40,7 +40,7 @@ impl ViewSource for Folder {
     }
 }
 
-/// An infinite error is `null` in JSON, so it is spelt out.
+/// JSON has no infinity, so an infinite error is written as "unknown".
 fn numbers(values: [f64; 9]) -> Value {
     let spelt = |value: &f64| if value.is_finite() { json!(value) } else { json!("unknown") };
     let three = |values: &[f64]| Value::Array(values.iter().map(spelt).collect());
@@ -70,7 +70,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         if data.test_every > 0 && index.is_multiple_of(data.test_every) {
             continue;
         }
-        let camera = scene.camera(view.camera_id).ok_or("a view names a camera that is not there")?;
+        let camera = scene.camera(view.camera_id).ok_or("a view refers to a missing camera")?;
         views.push(TrainView {
             name: view.name.clone(),
             camera: prepared_camera(camera, data.max_resolution)?,
@@ -82,21 +82,21 @@ fn main() -> Result<(), Box<dyn Error>> {
     }
     let source = Folder { views, files, data };
     let started = Instant::now();
-    let told = water_prior(&scene.points, &source, &scene_views, beyond_points)?;
+    let estimate = water_prior(&scene.points, &source, &scene_views, beyond_points)?;
     let seconds = started.elapsed().as_secs_f64();
-    let (prior, water) = (told.sparse.clone()?, told.water.ok_or("nothing tells of the water")?);
+    let (prior, water) = (estimate.sparse.clone()?, estimate.water.ok_or("the water cannot be estimated")?);
 
     let truth = root.join("truth/water.json");
     let truth: Option<Value> =
         if truth.is_file() { Some(serde_json::from_slice(&std::fs::read(truth)?)?) } else { None };
     let result = json!({
         "water": numbers(water.to_array()),
-        "standard_error": numbers(told.standard_error),
-        "by_direction": told.by_direction,
-        "open_water": told.open.as_ref().map(|open| json!({
+        "standard_error": numbers(estimate.standard_error),
+        "by_direction": estimate.by_direction,
+        "open_water": estimate.open.as_ref().map(|open| json!({
             "share": open.share, "views": open.views, "colour": open.colour().0, "standard_error": open.colour().1
         })),
-        "by_darkness": told.by_darkness,
+        "by_darkness": estimate.by_darkness,
         "by_points_alone": {
             "water": numbers(prior.water.to_array()), "standard_error": numbers(prior.standard_error)
         },

@@ -1,12 +1,11 @@
-//! A model in other axes: everything of a Gaussian that has a direction, turned.
+//! Rotates a model to other axes.
 //!
-//! A model lies in the axes of its photographs' poses. Who wants y down and the sides of the survey along x
-//! and z takes it in the frame that its plan was made in. Means and quaternions are turned by the rotation.
-//! The harmonics of a band mix among themselves: colour by direction must be what it was, so the coefficients
-//! c' of the turned Gaussian satisfy `sum c'_k Y_k(R d) = sum c_k Y_k(d)` for every direction d, and since
-//! Y_k(R d) of a band is an orthogonal matrix D times Y_k(d), c' = D c (Ivanic and Ruedenberg 1996). D is
-//! found by its definition, the integral of Y_k(R d) Y_l(d) over the sphere, with a quadrature that is exact
-//! for these polynomials.
+//! A model has the axes of its photographs' poses. The frame of its plan has y down and the sides of the
+//! survey along x and z. Means and quaternions are multiplied by the rotation. The harmonics of a band mix
+//! among themselves. Colour by direction must not change, so the coefficients c' of the rotated Gaussian
+//! satisfy `sum c'_k Y_k(R d) = sum c_k Y_k(d)` for every direction d. In a band, Y_k(R d) is an orthogonal
+//! matrix D times Y_k(d), so c' = D c (Ivanic and Ruedenberg 1996). D is computed by its definition, the
+//! integral of Y_k(R d) Y_l(d) over the sphere, with a quadrature that is exact for these polynomials.
 
 use glam::{DQuat, DVec3};
 use rayon::prelude::*;
@@ -16,40 +15,40 @@ use crate::harmonics::sh_basis;
 use crate::linear_colours::sphere;
 use crate::{CoreError, Result};
 
-/// Begins the comment of a model's header that says which axes it has: the rotation from the scene's axes to
-/// its own, order w x y z.
+/// Start of the header comment that states the axes of a model: the rotation from the scene's axes to its
+/// own, order w x y z.
 const COMMENT: &str = "fathom frame: scene_to_model_quat_wxyz ";
 
-/// The comment of a model whose axes are the scene's, turned by `rotation`.
+/// The header comment of a model whose axes are the scene's, rotated by `rotation`.
 pub fn comment(rotation: DQuat) -> String {
     let DQuat { x, y, z, w } = rotation;
     format!("{COMMENT}{w} {x} {y} {z}")
 }
 
-/// Whether a comment of a model's header says which axes it has.
+/// Whether a header comment states the axes of the model.
 pub fn is_in(comment: &str) -> bool {
     comment.starts_with(COMMENT)
 }
 
-/// The rotation from the scene's axes to the model's, by the comments of its header; `None` where it has the
-/// scene's.
+/// The rotation from the scene's axes to the model's, read from its header comments; `None` if the model has
+/// the scene's axes.
 ///
 /// # Errors
-/// When the comment does not hold four numbers of a rotation.
+/// When the comment does not hold the four numbers of a rotation.
 pub fn among(comments: &[String]) -> Result<Option<DQuat>> {
     let Some(words) = comments.iter().find_map(|comment| comment.strip_prefix(COMMENT)) else {
         return Ok(None);
     };
     let numbers: Vec<f64> = words.split_whitespace().filter_map(|word| word.parse().ok()).collect();
-    let refuse = || CoreError::Scene(format!("the frame in the model's header is no rotation: {words:?}"));
+    let refuse = || CoreError::Scene(format!("the frame in the model's header is not a rotation: {words:?}"));
     let [w, x, y, z] = <[f64; 4]>::try_from(numbers).map_err(|_| refuse())?;
     let rotation = DQuat::from_xyzw(x, y, z, w);
-    // Guarded positively, so that NaN fails.
+    // Phrased positively, so that NaN fails.
     let is_unit = (rotation.length() - 1.0).abs() < 1e-6;
     if is_unit { Ok(Some(rotation.normalize())) } else { Err(refuse()) }
 }
 
-/// The same model in axes that are turned by `rotation`: a point p of the old ones is `rotation * p`.
+/// The same model in rotated axes: a point p becomes `rotation * p`.
 #[must_use]
 pub fn turned(model: Gaussians, rotation: DQuat) -> Gaussians {
     let harmonics = harmonics(rotation);
@@ -82,8 +81,8 @@ fn band_of(k: usize) -> std::ops::Range<usize> {
     degree * degree..(degree + 1) * (degree + 1)
 }
 
-/// D of every band, one matrix: entry `[k][l]` is what coefficient l of the old axes gives to k of the new
-/// ones.
+/// D of every band in one matrix: entry `[k][l]` is the weight of the old coefficient l in the new
+/// coefficient k.
 fn harmonics(rotation: DQuat) -> [[f64; MAX_SH_COEFFS]; MAX_SH_COEFFS] {
     let mut sums = [[0.0; MAX_SH_COEFFS]; MAX_SH_COEFFS];
     for (direction, basis, weight) in sphere() {
@@ -141,7 +140,7 @@ mod tests {
     }
 
     #[test]
-    fn a_turned_gaussian_has_in_the_turned_direction_the_colour_that_it_had() {
+    fn a_rotated_gaussian_keeps_its_colour_in_the_rotated_direction() {
         for sh_degree in 0..=3 {
             let before = model(sh_degree, 20);
             for case in 0..10 {
@@ -160,7 +159,7 @@ mod tests {
     }
 
     #[test]
-    fn a_turned_gaussian_has_the_turned_place_and_shape() {
+    fn a_rotated_gaussian_has_the_rotated_position_and_shape() {
         let (before, rotation) = (model(1, 30), rotation(3));
         let after = turned(before.clone(), rotation);
         let covariance = |model: &Gaussians, index: usize, along: DVec3| {
@@ -180,7 +179,7 @@ mod tests {
     }
 
     #[test]
-    fn turning_there_and_back_gives_the_model_again() {
+    fn rotating_there_and_back_gives_the_same_model() {
         let (before, rotation) = (model(3, 30), rotation(7));
         let after = turned(turned(before.clone(), rotation), rotation.inverse());
         let close = |a: &[f32], b: &[f32]| a.iter().zip(b).all(|(a, b)| (a - b).abs() < 3e-6);
@@ -190,10 +189,10 @@ mod tests {
     }
 
     #[test]
-    fn a_header_tells_the_frame_to_the_last_bit_and_what_is_no_rotation_is_refused() {
+    fn a_header_keeps_the_frame_and_refuses_a_non_rotation() {
         let rotation = rotation(5);
-        let said = among(&["by hand".to_owned(), comment(rotation)]).expect("a frame").expect("one");
-        assert!((said.x - rotation.x).abs() < 1e-15 && (said.w - rotation.w).abs() < 1e-15);
+        let found = among(&["by hand".to_owned(), comment(rotation)]).expect("a frame").expect("one");
+        assert!((found.x - rotation.x).abs() < 1e-15 && (found.w - rotation.w).abs() < 1e-15);
         assert_eq!(among(&["by hand".to_owned()]).expect("no frame"), None);
         for wrong in ["1 0 0", "1 0 0 x", "2 0 0 0", "NaN 0 0 0"] {
             let error = among(&[format!("{COMMENT}{wrong}")]).expect_err(wrong).to_string();

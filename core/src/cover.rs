@@ -1,24 +1,23 @@
-//! Cover: whether a model fills what its photographs show, leaves open water empty, and is asked for what
-//! nobody saw.
+//! Cover: whether a model fills what its photographs show, leaves open water empty, and is rendered where too
+//! few training views look.
 //!
-//! Three numbers of held-out views, which PSNR mixes:
+//! Three measures on held-out views, which PSNR mixes:
 //!
-//! - `holes`: of the pixels that two training views cover, the share that the model leaves open. A pixel is
-//!   covered where a sparse point that at least two training views see projects near it. Where it is known
-//!   which pixels show a surface ([`HeldOut::truth`]), a pixel is covered where it shows one and its place
-//!   lies in at least two training views.
-//! - `open_water`: the light that is left in J where there is nothing, as a share of J's white. There J
-//!   should be black: what is left is veil that was taken for scene.
-//! - `unseen`: of the pixels where the model has a surface, the share whose place fewer than two training
-//!   views see. The model extrapolates there, and no training can help.
+//! - `holes`: the share of covered pixels that the model leaves open. A pixel is covered if a sparse point
+//!   that at least two training views see projects near it. With a truth ([`HeldOut::truth`]), a pixel is
+//!   covered if it shows a surface whose position lies in at least two training views.
+//! - `open_water`: the light left in J where there is no surface, as a share of J's white. J should be black
+//!   there: remaining light is backscatter that was attributed to the scene.
+//! - `unseen`: of the pixels where the model has a surface, the share whose position fewer than two training
+//!   views see. The model extrapolates there, and training cannot help.
 //!
-//! A place counts as seen by a view when it projects into its picture, before the camera. Whether something
-//! stands between is not asked: `unseen` is a lower bound, and covered pixels an upper one. Pixels that the
+//! A view counts as seeing a position that projects into its picture, in front of the camera. Occlusion is
+//! ignored, so `unseen` is a lower bound and the number of covered pixels an upper bound. Pixels that the
 //! mask of a photograph leaves out count nowhere.
 //!
-//! Work is bounded: places are asked for on a grid of at most 4,096 pixels a view, of the 4,096 training
-//! views whose cameras stand nearest. No GPU here: a caller renders. Sums go in the order of pixels and
-//! views, so a number does not depend on threads.
+//! Work is bounded: positions are tested on a grid of at most 4,096 pixels a view, against the 4,096 training
+//! views with the nearest cameras. No GPU here: a caller renders. Sums run in the order of pixels and views,
+//! so results do not depend on threads.
 
 use std::collections::HashMap;
 
@@ -32,36 +31,36 @@ use crate::scene::{PinholeCamera, Points, Pose};
 use crate::seams::SURFACE_ALPHA;
 use crate::views::PackedImage;
 
-/// What `metrics.json` says of these numbers.
+/// The description of these measures in `metrics.json`.
 pub const PROTOCOL: &str = "holes: of the covered pixels, the share with alpha below 0.9; covered: within 1/100 of the longer \
-     side of a sparse point that two training views see (by tracks, otherwise by projection), with a truth instead pixels that it \
-     says show a surface, whose place at the range of the nearest sparse point of the view, within 1/10 of the longer side, lies in \
-     two training views; open_water: mean linear light of J where alpha is below 0.5, with a truth instead where it has no \
-     surface within a pixel, as a share of the 99th percentile of the brightest channel of J where alpha is above 0.9; \
-     unseen: of pixels with alpha above 0.5, the share whose place at the expected range lies in the pictures of fewer than \
-     two training views, whatever stands between; all over all held-out pixels that are not masked, on a grid where places are asked for";
+     side of a sparse point that two training views see (by tracks, otherwise by projection), with a truth instead: pixels with a \
+     surface whose position, at the range of the nearest sparse point of the view within 1/10 of the longer side, lies in two \
+     training views; open_water: mean linear light of J where alpha is below 0.5, with a truth instead where it has no surface \
+     within a pixel, as a share of the 99th percentile of the brightest channel of J where alpha is above 0.9; unseen: of pixels \
+     with alpha above 0.5, the share whose position at the expected range lies in the pictures of fewer than two training views, \
+     occlusion ignored; all over all held-out pixels that are not masked, on a grid where positions are needed";
 
 /// A covered pixel with less alpha is a hole.
 const CLOSED_ALPHA: f32 = 0.9;
-/// Pixels with more alpha say what J's white is: through them nothing else is seen.
+/// Pixels with more alpha determine J's white: they are opaque.
 const WHITE_ALPHA: f32 = 0.9;
-/// Percentile of the brightest channel that is J's white: a few highlights are no white.
+/// Percentile of the brightest channel that counts as J's white; it excludes a few highlights.
 const WHITE: f64 = 0.99;
-/// How far around a sparse point pixels are covered, as a share of the longer side of the picture.
+/// Radius around a sparse point within which pixels are covered, as a share of the longer side of the
+/// picture.
 const COVERS: f64 = 0.01;
-/// How far around a sparse point its range says how far a pixel is, as a share of the longer side of the
+/// Radius around a sparse point within which pixels take its range, as a share of the longer side of the
 /// picture.
 const REACHES: f64 = 0.1;
-/// Pixels of a view at most of which the place is asked.
+/// Most pixels of a view whose position is tested.
 const GRID: usize = 4096;
-/// Training views at most that are asked for places of one view: those nearest to it. Few of the others look
-/// there.
+/// Most training views that are tested for one view: those nearest to it. Few of the others look there.
 const NEAR_VIEWS: usize = 4096;
-/// Sparse points at most of one view that are compared with every pixel of its grid.
+/// Most sparse points of one view that are compared with every pixel of its grid.
 const RANGES: usize = 4096;
-/// Sparse points without tracks at most that are looked for in training views, for one view.
+/// For one view, most sparse points without tracks that are projected into training views.
 const UNTRACKED: usize = 32_768;
-/// Held-out views at most by which [`predicted_unseen`] predicts.
+/// Most held-out views that [`predicted_unseen`] uses.
 const PREDICTED: usize = 256;
 
 /// A camera that a model was trained on.
@@ -82,13 +81,13 @@ struct Spot {
     range: f64,
 }
 
-/// What training had: its views and the sparse points.
+/// Input of the training: its views and the sparse points.
 struct Trained<'a> {
     eyes: Vec<Eye>,
     points: &'a Points,
     /// Which points at least two training views see; `None` without tracks.
     seen_twice: Option<Vec<bool>>,
-    /// Points that held-out views see, by index of the view; empty without tracks.
+    /// Points that each held-out view sees, by index of the view; empty without tracks.
     of_view: HashMap<u32, Vec<usize>>,
 }
 
@@ -146,8 +145,8 @@ impl<'a> Trained<'a> {
         DVec3::from(self.points.positions[point].map(f64::from))
     }
 
-    /// The points that a held-out view sees: by tracks where there are any, otherwise all that project into
-    /// its picture.
+    /// The points that a held-out view sees: by tracks if there are any, otherwise all that project into its
+    /// picture.
     fn seen_in(&self, index: u32, camera: &PinholeCamera, pose: &Pose) -> Vec<Spot> {
         let spot = |point| self.spot(camera, pose, point);
         match &self.seen_twice {
@@ -156,7 +155,7 @@ impl<'a> Trained<'a> {
         }
     }
 
-    /// Where points that at least two training views see project into a picture.
+    /// The pixel positions in a picture of points that at least two training views see.
     fn covering(&self, camera: &PinholeCamera, pose: &Pose, near: &[&Eye]) -> Vec<[f64; 2]> {
         let all = (0..self.points.len()).into_par_iter();
         if let Some(twice) = &self.seen_twice {
@@ -187,7 +186,7 @@ pub struct HeldOut<'a> {
     pub photograph: &'a PackedImage,
     /// J of the render; `None` without a medium.
     pub clear: Option<&'a PackedImage>,
-    /// A picture whose mask says where there is a surface; `None` where nobody knows.
+    /// A picture whose mask holds where there is a surface; `None` if unknown.
     pub truth: Option<&'a PackedImage>,
 }
 
@@ -196,13 +195,13 @@ impl HeldOut<'_> {
         has_mask(self.photograph, pixel)
     }
 
-    /// Phrased so that NaN is no surface, but a hole.
+    /// Phrased so that NaN counts as a hole.
     fn has_alpha(&self, pixel: usize, least: f32) -> bool {
         self.alpha[pixel] >= least
     }
 
-    /// Whether there is no surface at a pixel, and with a truth none at its eight neighbours: the mask of a
-    /// truth leaves out pixels that show a surface in part.
+    /// Whether a pixel has no surface. With a truth, its eight neighbours must have none either, because the
+    /// mask of a truth leaves out pixels that show a surface in part.
     fn is_open(&self, pixel: usize) -> bool {
         let Some(truth) = self.truth else { return !self.has_alpha(pixel, SURFACE_ALPHA) };
         let (width, height) = (truth.width as usize, truth.height as usize);
@@ -212,18 +211,18 @@ impl HeldOut<'_> {
     }
 }
 
-/// Numbers of one view; `None` where nothing can be said.
+/// Measures of one view; `None` if there are no pixels to measure.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct ViewCover {
     /// Share of the covered pixels that are open, 0 to 1.
     pub holes: Option<f64>,
-    /// Light left in J where there is nothing, as a share of J's white of all views.
+    /// Light left in J where there is no surface, as a share of the white of J over all views.
     pub open_water: Option<f64>,
     /// Share of the pixels with a surface that fewer than two training views see, 0 to 1.
     pub unseen: Option<f64>,
 }
 
-/// What was measured; the numbers of all views are over all their pixels.
+/// The results; the measures of all views are over all their pixels.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct CoverReport {
     /// Of all views.
@@ -234,7 +233,7 @@ pub struct CoverReport {
     pub views: Vec<ViewCover>,
 }
 
-/// A sum over pixels, and over how many.
+/// A sum over pixels, and the number of pixels.
 #[derive(Clone, Copy, Default)]
 struct Share {
     sum: f64,
@@ -242,7 +241,7 @@ struct Share {
 }
 
 impl Share {
-    /// Of pixels that each stand for `weight` of the picture.
+    /// The share of `true`; each pixel stands for `weight` pixels of the picture.
     fn of(pixels: impl Iterator<Item = bool>, weight: f64) -> Self {
         let (held, all) =
             pixels.fold((0_u64, 0_u64), |(held, all), holds| (held + u64::from(holds), all + 1));
@@ -278,14 +277,14 @@ impl Sums {
 pub struct CoverMeter<'a> {
     trained: Trained<'a>,
     views: Vec<Sums>,
-    /// How many pixels have which brightest channel of J, 8-bit sRGB.
+    /// Histogram of the brightest channel of J, 8-bit sRGB.
     brightest: [u64; 256],
 }
 
 impl<'a> CoverMeter<'a> {
-    /// Nothing measured yet. `views` are the cameras and poses (world to camera) of all views of the scene by
-    /// name, as the tracks of `points` number them; all but `held_out`, indices into them, count as trained
-    /// on.
+    /// A meter without measurements. `views` are the cameras and poses (world to camera) of all views of the
+    /// scene by name, as the tracks of `points` number them. All except those with an index in `held_out`
+    /// count as training views.
     pub fn new(views: &[(PinholeCamera, Pose)], held_out: &[u32], points: &'a Points) -> Self {
         Self { trained: Trained::new(views, held_out, points), views: Vec::new(), brightest: [0; 256] }
     }
@@ -304,7 +303,7 @@ impl<'a> CoverMeter<'a> {
         self.views.push(sums);
     }
 
-    /// Everything that was measured, the views in the order in which they were added.
+    /// The results, with the views in the order in which they were added.
     pub fn report(self) -> CoverReport {
         let white = self.white();
         let mut all = Sums::default();
@@ -336,7 +335,7 @@ impl<'a> CoverMeter<'a> {
         Share::of(covered.map(|(pixel, _)| is_hole(*pixel)), weight)
     }
 
-    /// Also counts what says how bright J's white is.
+    /// Also fills the histogram for J's white.
     fn open_water(&mut self, view: &HeldOut<'_>, clear: &PackedImage) -> Share {
         let light: Vec<f64> = (0..=255).map(|code| srgb_to_linear(f64::from(code) / 255.0)).collect();
         let mut open = Share::default();
@@ -379,13 +378,13 @@ fn unseen(view: &HeldOut<'_>, near: &[&Eye]) -> Share {
     Share::of(unseen.into_iter(), weight)
 }
 
-/// Foretells `unseen` before there is a model, from the sparse points: the share of the held-out pixels whose
-/// place, at the range of the nearest sparse point of the view in the picture, at most 1/10 of the longer
-/// side away, fewer than two training views see. Pixels without such a point are left out.
+/// Predicts `unseen` from the sparse points, before there is a model. Each held-out pixel takes the range of
+/// the view's nearest sparse point, at most 1/10 of the longer side away. The result is the share of these
+/// positions that fewer than two training views see. Pixels without such a point are left out.
 ///
 /// `views` and `held_out` as in [`CoverMeter::new`]; a view's points are those whose track names it, or
-/// without tracks all that project into its picture. Held-out views are thinned out evenly to at most 256.
-/// `None` without training views or where no pixel has a point.
+/// without tracks all that project into its picture. At most 256 held-out views are used, evenly spaced.
+/// `None` without training views or if no pixel has a point.
 pub fn predicted_unseen(views: &[(PinholeCamera, Pose)], held_out: &[u32], points: &Points) -> Option<f64> {
     let trained = Trained::new(views, held_out, points);
     if trained.eyes.is_empty() {
@@ -404,7 +403,7 @@ pub fn predicted_unseen(views: &[(PinholeCamera, Pose)], held_out: &[u32], point
     all.value()
 }
 
-/// Puts a report into a `metrics.json` whose `views` are those that were measured; nulls where there is none.
+/// Puts a report into a `metrics.json` whose `views` are those that were measured; nulls without a report.
 pub fn put_into(metrics: &mut Value, report: Option<&CoverReport>) {
     let put = |into: &mut Value, of: ViewCover| {
         into["holes"] = json!(of.holes);
@@ -418,8 +417,8 @@ pub fn put_into(metrics: &mut Value, report: Option<&CoverReport>) {
     }
 }
 
-/// Where a point is in a picture, pixels from the top-left corner, and how far from the camera; `None`
-/// outside of it.
+/// Position of a point in a picture, pixels from the top-left corner, and its distance from the camera;
+/// `None` outside the picture.
 fn project(camera: &PinholeCamera, pose: &Pose, point: DVec3) -> Option<([f64; 2], f64)> {
     let p = pose.transform(point);
     let (x, y) = (camera.fx * p.x / p.z + camera.cx, camera.fy * p.y / p.z + camera.cy);
@@ -433,13 +432,13 @@ fn is_seen_twice(eyes: &[&Eye], place: DVec3) -> bool {
     eyes.iter().filter(|eye| project(&eye.camera, &eye.pose, place).is_some()).nth(1).is_some()
 }
 
-/// The place, world, that a pixel shows at a distance along its ray.
+/// The world position that a pixel shows at a distance along its ray.
 fn place(camera: &PinholeCamera, pose: &Pose, pixel: usize, range: f64) -> DVec3 {
     pose.centre() + pose.rotation.inverse() * camera.direction(pixel) * range
 }
 
-/// The places of pixels at the range of the nearest spot in the picture; `None` where none is near. Spots are
-/// thinned out.
+/// The positions of pixels at the range of the nearest spot in the picture; `None` if none is near. At most
+/// [`RANGES`] spots are used.
 fn places(camera: &PinholeCamera, pose: &Pose, pixels: &[usize], spots: &[Spot]) -> Vec<Option<DVec3>> {
     let spots: Vec<Spot> = thinned(spots, RANGES).copied().collect();
     let reach = REACHES * f64::from(camera.width.max(camera.height));
@@ -453,12 +452,12 @@ fn places(camera: &PinholeCamera, pose: &Pose, pixels: &[usize], spots: &[Spot])
     pixels.par_iter().map(of_pixel).collect()
 }
 
-/// The pixels whose middle lies within [`COVERS`] of a spot, at least a pixel, `[H*W]`.
+/// The pixels whose middle lies within [`COVERS`] of a spot, with a radius of at least one pixel, `[H*W]`.
 fn discs(camera: &PinholeCamera, spots: &[[f64; 2]]) -> Vec<bool> {
     let (width, height) = (camera.width as usize, camera.height as usize);
     let radius = (COVERS * width.max(height) as f64).max(1.0);
-    // How many discs begin at a pixel, less those that end before it; a column more, for those that reach the
-    // border.
+    // Number of discs that begin at a pixel, minus those that end before it. One extra column takes the discs
+    // that reach the border.
     let mut changes = vec![0_i64; (width + 1) * height];
     // Pixels whose middle lies in [low, high] along a side.
     let within = |low: f64, high: f64, len: usize| {

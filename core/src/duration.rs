@@ -1,10 +1,9 @@
-//! Time of a run, told before it begins.
+//! Predicts the duration of a run before it begins.
 //!
-//! A step costs something for every pixel, every Gaussian that the view sees and every Gaussian that there
-//! is: `seconds a step = PIXEL * pixels + VISIBLE * visible + GAUSSIAN * gaussians`. The three numbers are
-//! those of the one adapter that BENCHMARKS.md has figures of (llvmpipe on 2 cores), in CPU seconds. Other
-//! adapters are faster by a factor that this cannot know, so a forecast says how runs compare with each
-//! other, which is what a plan needs.
+//! A step costs time for every pixel, every visible Gaussian and every Gaussian of the run: `seconds a step =
+//! PIXEL * pixels + VISIBLE * visible + GAUSSIAN * gaussians`. The three constants are CPU seconds on
+//! llvmpipe with 2 cores, the adapter of the figures in BENCHMARKS.md. Other adapters are faster by an
+//! unknown factor. A forecast therefore only compares runs with each other, which is all that a plan needs.
 //!
 //! | run (bench/history.jsonl) | CPU s a step | by the formula |
 //! |---|---|---|
@@ -15,15 +14,15 @@
 
 use crate::config::TrainConfig;
 
-/// CPU seconds a pixel of the picture in a step.
+/// CPU seconds a step for each pixel of the picture.
 const PIXEL: f64 = 1.8e-6;
-/// CPU seconds a Gaussian that the view sees.
+/// CPU seconds a step for each Gaussian that the view sees.
 const VISIBLE: f64 = 9.5e-6;
-/// CPU seconds a Gaussian of the run, seen or not.
+/// CPU seconds a step for each Gaussian of the run, visible or not.
 const GAUSSIAN: f64 = 0.14e-6;
 
-/// CPU seconds of a run of `config.iterations` steps on `pictures` (width, height), with `gaussians` at its
-/// cap, trained ones and others, of which a view sees `visible` as a mean. 0 without pictures.
+/// CPU seconds of a run of `config.iterations` steps on `pictures` (width, height). `gaussians` is its cap,
+/// trained ones and others together; a view sees `visible` of them on average. 0 without pictures.
 pub fn seconds(config: &TrainConfig, pictures: &[[u32; 2]], gaussians: u64, visible: f64) -> f64 {
     let [quarter, half] = config.resolution_at.map(|at| f64::from(at.clamp(0.0, 1.0)));
     let shares = [(quarter, 2), (half - quarter, 1), (1.0 - half, 0)];
@@ -48,7 +47,7 @@ mod tests {
     }
 
     #[test]
-    fn the_formula_is_within_a_tenth_of_the_runs_that_it_was_fitted_to() {
+    fn the_formula_is_within_a_tenth_of_the_runs_it_was_fitted_to() {
         let sized = TrainConfig { iterations: 1, ..TrainConfig::default() };
         for (config, picture, gaussians, visible, measured) in [
             (at_full_size(1), [225, 400], 13_500, 7_000.0, 0.223),
@@ -62,7 +61,7 @@ mod tests {
     }
 
     #[test]
-    fn a_run_takes_time_in_proportion_to_its_iterations_and_less_at_smaller_sizes() {
+    fn time_grows_with_iterations_and_falls_with_picture_size() {
         let run = |iterations| seconds(&at_full_size(iterations), &[[800, 600], [400, 300]], 1000, 500.0);
         assert!((run(300) - 3.0 * run(100)).abs() < 1e-9);
         let sized = TrainConfig { iterations: 300, ..TrainConfig::default() };

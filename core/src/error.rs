@@ -1,14 +1,14 @@
 //! The one error type of this crate.
 //!
-//! A variant exists where somebody acts on it (the worker reports memory errors by class, ingest
-//! names the file); everything else is a sentence with the fact and the way out.
+//! An error has a variant of its own if callers act on it: the worker reports memory errors by class, ingest
+//! names the file. All others are one sentence that states the fact and the remedy.
 
 use std::path::PathBuf;
 
 /// Result with [`CoreError`].
 pub type Result<T, E = CoreError> = std::result::Result<T, E>;
 
-/// What can go wrong in the trainer and its readers.
+/// Errors of the trainer and its readers.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum CoreError {
@@ -19,24 +19,24 @@ pub enum CoreError {
         action: &'static str,
         /// The file or directory.
         path: PathBuf,
-        /// What the system said.
+        /// The error from the operating system.
         source: std::io::Error,
     },
-    /// Input that cannot be used: which file, where in it, what is wrong and what helps.
+    /// Unusable input: the file, the place in it, the fault and the remedy.
     #[error("{path}: {message}", path = path.display())]
     Input {
         /// The file at fault.
         path: PathBuf,
-        /// Place, fact and way out, one sentence.
+        /// Place, fact and remedy in one sentence.
         message: String,
     },
-    /// A scene that was read but cannot serve the purpose.
+    /// A scene that was read but is unsuitable for the purpose.
     #[error("{0}")]
     Scene(String),
     /// A configuration value out of its range, or two that contradict each other.
     #[error("configuration: {0}")]
     Config(String),
-    /// No adapter that may be used.
+    /// No usable adapter.
     #[error("{0}")]
     NoAdapter(String),
     /// A buffer that the device cannot bind or hold.
@@ -45,7 +45,7 @@ pub enum CoreError {
         too_large(buffer, *needed_bytes, *limit_bytes)
     )]
     BufferTooLarge {
-        /// Which buffer.
+        /// Name of the buffer.
         buffer: &'static str,
         /// Bytes it needs.
         needed_bytes: u64,
@@ -58,25 +58,25 @@ pub enum CoreError {
         out_of_memory(*needed_bytes, *available_bytes, message)
     )]
     OutOfMemory {
-        /// What is allocated and what was asked for together, so the work needs at least as much; `None`
-        /// where that is not known.
+        /// Allocated plus requested bytes, so the work needs at least this much; `None` if unknown.
         needed_bytes: Option<u64>,
-        /// The limit where one was set and refused; else what the driver had given before it refused.
+        /// The limit if one was set and exceeded; otherwise the bytes that the driver had granted before it
+        /// refused.
         available_bytes: Option<u64>,
-        /// Who refused what.
+        /// What refused which allocation.
         message: String,
     },
-    /// The device is gone: a driver that was reset or updated, a GPU that was unplugged or hung. Open
-    /// another.
-    #[error("the GPU was lost ({message}); what it was doing has to be done again")]
+    /// The device is lost: the driver was reset or updated, or the GPU was unplugged or hung. Open another
+    /// device.
+    #[error("the GPU was lost ({message}); the interrupted work must be repeated")]
     DeviceLost {
-        /// What the driver said.
+        /// The message of the driver.
         message: String,
     },
     /// The device refused a command.
     #[error("GPU: {0}")]
     Gpu(String),
-    /// A network that cannot take what it was given, or has diverged.
+    /// A network that got unsuitable input, or has diverged.
     #[error("network: {0}")]
     Network(String),
     /// A checkpoint that must not be used.
@@ -85,13 +85,13 @@ pub enum CoreError {
 }
 
 impl CoreError {
-    /// An [`CoreError::Io`] in the making: `.map_err(CoreError::io("read", path))`.
+    /// Builds a [`CoreError::Io`]: `.map_err(CoreError::io("read", path))`.
     pub fn io(action: &'static str, path: impl Into<PathBuf>) -> impl FnOnce(std::io::Error) -> Self {
         let path = path.into();
         move |source| Self::Io { action, path, source }
     }
 
-    /// What the device has no room for, without the advice, which is for who trains; `None` for other errors.
+    /// The memory shortage without the advice, which is for people who train; `None` for other errors.
     pub fn shortage(&self) -> Option<String> {
         match self {
             Self::BufferTooLarge { buffer, needed_bytes, limit_bytes } => {
@@ -124,7 +124,7 @@ fn out_of_memory(needed_bytes: Option<u64>, available_bytes: Option<u64>, messag
     format!("the GPU is out of memory{need}: {message}")
 }
 
-/// Bytes for people, "1.5 GiB", binary as memory is sold.
+/// Bytes for people, "1.5 GiB", in binary units as memory is sold.
 pub(crate) struct Size(pub u64);
 
 impl std::fmt::Display for Size {
@@ -159,7 +159,7 @@ mod tests {
     }
 
     #[test]
-    fn memory_that_ends_is_told_with_need_stock_and_way_out() {
+    fn out_of_memory_reports_needed_and_available_bytes() {
         let error = CoreError::OutOfMemory {
             needed_bytes: Some(5_583_457_485),
             available_bytes: Some(4_187_593_114),

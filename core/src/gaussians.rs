@@ -9,12 +9,12 @@ pub const MAX_SH_COEFFS: usize = 16;
 /// Y_0^0, the constant spherical harmonic: colour = 0.5 + SH_C0 * f_dc.
 pub const SH_C0: f32 = 0.282_094_8;
 
-/// Whether a Gaussian is so large that it is part of what many partitions see: haze, and the far field.
+/// Whether a Gaussian is so large that many partitions see it: haze and distant background.
 ///
-/// Every partition renders it as the coarse model has it, and the one in whose cell it lies hands it in
-/// unchanged. Were it trained, each partition would fit its own copy to its own views, and the merge would
-/// give all of them one that only one has seen. A deviation of a fifth of the usual viewing distance covers a
-/// picture; where that distance is not known, nothing is shared.
+/// Every partition renders it as in the coarse model, and the partition whose cell contains it submits it
+/// unchanged. If it were trained, each partition would fit its own copy to its own views, and the merged
+/// model would keep only one of them. A standard deviation of a fifth of the scene scale (`viewing_distance`)
+/// covers a picture. If the scene scale is unknown, no Gaussian is shared.
 pub fn is_shared(log_scale: [f32; 3], viewing_distance: Option<f32>) -> bool {
     const SHARE: f32 = 0.2;
     viewing_distance.is_some_and(|distance| log_scale.iter().any(|log| log.exp() > SHARE * distance))
@@ -37,8 +37,8 @@ pub struct Gaussians {
     pub sh_coeffs: Vec<[f32; 3]>,
 }
 
-/// Where a Gaussian is and how large, as devices have it: centre and logit of opacity; quaternion; logarithms
-/// of scales.
+/// Position and size of a Gaussian in the layout of the device: centre and opacity logit; quaternion;
+/// logarithms of the scales.
 pub type Transform = [[f32; 4]; 3];
 
 impl Gaussians {
@@ -62,17 +62,17 @@ impl Gaussians {
         (self.sh_degree as usize + 1).pow(2)
     }
 
-    /// Where a Gaussian is and how large.
+    /// Position and size of a Gaussian.
     pub fn transform(&self, index: usize) -> Transform {
         let [x, y, z] = self.means[index];
         let [sx, sy, sz] = self.log_scales[index];
         [[x, y, z, self.opacity_logits[index]], self.quats[index], [sx, sy, sz, 0.0]]
     }
 
-    /// The unit normal of each Gaussian: its shortest axis, on the side that `eye` is on; world axes,
+    /// The unit normal of each Gaussian: its shortest axis, pointing to the side of `eye`; world axes,
     /// `[N,3]`.
     ///
-    /// Of a Gaussian without a single shortest axis it is one of them, and zero of one whose quaternion is.
+    /// If several axes are equally short, it is one of them. It is zero for a zero quaternion.
     pub fn normals_towards(&self, eye: DVec3) -> Vec<[f32; 3]> {
         let normal = |index: usize| {
             let [x, y, z] = self.log_scales[index];
@@ -91,15 +91,15 @@ impl Gaussians {
         (0..self.len()).into_par_iter().map(|index| normal(index).as_vec3().to_array()).collect()
     }
 
-    /// Whether Gaussian `index` is haze or far field: wider than a fifth of the usual viewing distance, scene
-    /// units. Where that is not known, none is.
+    /// Whether Gaussian `index` is haze or distant background: wider than a fifth of the scene scale
+    /// (`viewing_distance`, scene units). If that is unknown, none is.
     pub fn is_wide(&self, index: usize, viewing_distance: Option<f32>) -> bool {
         is_shared(self.log_scales[index], viewing_distance)
     }
 
-    /// What of the model can be a surface, of degree 0: all but haze, which would move surfaces towards the
-    /// camera, and the far field, which would end rays that meet none. For alpha and range, which no water
-    /// changes.
+    /// The Gaussians that can be surfaces, at degree 0. Haze is left out because it would move surfaces
+    /// towards the camera, and distant background because it would end rays that meet no surface. Meant for
+    /// alpha and range, which water does not change.
     #[must_use]
     pub fn surfaces(&self, viewing_distance: Option<f32>) -> Self {
         let (mut surfaces, k) = (Self::empty(0), self.coeffs());
@@ -113,7 +113,7 @@ impl Gaussians {
         surfaces
     }
 
-    /// Appends Gaussian `index` of `other`; both must have one degree.
+    /// Appends Gaussian `index` of `other`; both must have the same degree.
     pub fn push_from(&mut self, other: &Self, index: usize) {
         debug_assert_eq!(self.sh_degree, other.sh_degree);
         let k = other.coeffs();
@@ -136,7 +136,7 @@ impl Gaussians {
         self.split_where(|index| keep(self.means[index]))
     }
 
-    /// Those whose index `keep` holds, and the others; both in their order.
+    /// The Gaussians whose index satisfies `keep`, in order, and the others, in order.
     pub fn split_where(&self, mut keep: impl FnMut(usize) -> bool) -> (Self, Self) {
         let (mut inside, mut outside) = (Self::empty(self.sh_degree), Self::empty(self.sh_degree));
         for index in 0..self.len() {
@@ -152,7 +152,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn gaussians_wider_than_a_fifth_of_the_viewing_distance_are_shared() {
+    fn gaussians_wider_than_a_fifth_of_the_scene_scale_are_shared() {
         let log_scale = |x: f32, y: f32, z: f32| [x.ln(), y.ln(), z.ln()];
         assert!(!is_shared(log_scale(0.9, 0.9, 0.9), Some(5.0)));
         assert!(is_shared(log_scale(0.1, 1.1, 0.1), Some(5.0)));
@@ -164,8 +164,8 @@ mod tests {
     fn a_normal_is_the_shortest_axis_on_the_side_of_the_eye() {
         let half = std::f32::consts::FRAC_1_SQRT_2;
         let mut model = Gaussians::empty(0);
-        // Flat along its z, not turned; flat along its x, turned by 90 degrees about z and not of unit
-        // length.
+        // The first is flat along z and not rotated. The second is flat along x, rotated by 90 degrees about
+        // z, and its quaternion is not of unit length.
         for (quat, log_scale) in
             [([1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -3.0]), ([3.0 * half, 0.0, 0.0, 3.0 * half], [-3.0, 0.0, 0.0])]
         {
@@ -191,7 +191,7 @@ mod tests {
     }
 
     #[test]
-    fn gaussians_wider_than_a_fifth_of_the_viewing_distance_are_no_surface() {
+    fn gaussians_wider_than_a_fifth_of_the_scale_are_no_surface() {
         let mut model = Gaussians::empty(1);
         for (index, deviation) in [0.9_f32, 1.1, 1e3].into_iter().enumerate() {
             model.means.push([index as f32, 0.0, 0.0]);

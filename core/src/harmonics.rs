@@ -1,5 +1,4 @@
-//! Real spherical harmonics up to degree 3, with the signs of 3DGS: the basis in which Gaussians keep their
-//! colours.
+//! Real spherical harmonics up to degree 3, with the signs of 3DGS: the basis of the Gaussians' colours.
 //!
 //! The basis is Y_l^m with the Condon-Shortley phase, written as polynomials of a unit direction
 //! (Sloan 2013), coefficients in the order l^2 + l + m.

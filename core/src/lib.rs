@@ -1,7 +1,7 @@
 //! The trainer of Fathom: scenes, models, pictures, GPU kernels and training.
 //!
-//! No network and no async here: a caller hands in views and Gaussians and gets Gaussians back.
-//! Everything that needs a GPU sits behind the feature `gpu`; a coordinator alone builds without it.
+//! No network and no async here: a caller passes views and Gaussians and gets Gaussians back. Everything that
+//! needs a GPU is behind the feature `gpu`; a coordinator alone builds without it.
 
 pub mod appearance;
 pub mod axes;

@@ -1,4 +1,4 @@
-//! Colours in linear light for programs that blend in it: spherical harmonics refitted from those in sRGB.
+//! Converts sRGB spherical harmonics to linear light, for programs that blend in linear light.
 
 use std::f64::consts::PI;
 
@@ -9,8 +9,8 @@ use crate::gaussians::{Gaussians, MAX_SH_COEFFS};
 use crate::harmonics::sh_basis;
 use crate::picture::srgb_to_linear;
 
-/// Gauss-Legendre: nodes above 0 and weights of eight points, with sixteen meridians exact for polynomials of
-/// degree 15.
+/// Gauss-Legendre with eight points: the nodes above 0 and their weights. With sixteen meridians it is exact
+/// for polynomials of degree 15.
 const LATITUDES: [(f64, f64); 4] = [
     (0.183_434_642_495_649_8, 0.362_683_783_378_362),
     (0.525_532_409_916_329, 0.313_706_645_877_887_3),
@@ -19,16 +19,16 @@ const LATITUDES: [(f64, f64); 4] = [
 ];
 const MERIDIANS: u32 = 16;
 
-/// The model with its colours in linear light, of the same degree: of each Gaussian the harmonics nearest to
-/// its decoded colour, least squares over all directions. Exact for degree 0. A colour below 0, which is
-/// shown as black, is 0.
+/// The model with its colours in linear light, at the same degree. Each Gaussian gets the harmonics that fit
+/// its decoded colour best, by least squares over all directions. Exact for degree 0. Colours below 0, which
+/// render as black, become 0.
 #[must_use]
 pub fn in_linear_light(model: Gaussians) -> Gaussians {
     refitted(model, |rgb| rgb.map(|s| srgb_to_linear(s.max(0.0))))
 }
 
-/// The model with harmonics, of the same degree, nearest to what `of` makes of its colours, least squares
-/// over all directions.
+/// The model with harmonics of the same degree that fit `of` of its colours best, by least squares over all
+/// directions.
 pub(crate) fn refitted(model: Gaussians, of: impl Fn([f64; 3]) -> [f64; 3] + Sync) -> Gaussians {
     let samples = sphere();
     let coeffs = model.coeffs();
@@ -54,7 +54,7 @@ pub(crate) fn refitted(model: Gaussians, of: impl Fn([f64; 3]) -> [f64; 3] + Syn
     Gaussians { sh_coeffs: refitted, ..model }
 }
 
-/// Directions all over the sphere with the basis there, and weights that sum to its area.
+/// Directions over the whole sphere, with the basis at each and weights that sum to the sphere's area.
 pub(crate) fn sphere() -> Vec<(DVec3, [f64; MAX_SH_COEFFS], f64)> {
     let mut samples = Vec::new();
     for (height, weight) in LATITUDES.into_iter().flat_map(|(node, weight)| [(node, weight), (-node, weight)])
@@ -110,7 +110,7 @@ mod tests {
     }
 
     #[test]
-    fn plain_colours_are_decoded_exactly_and_black_stays_black() {
+    fn sh0_is_decoded_exactly_and_black_stays_black() {
         let mut srgb = model(0, 0.0);
         srgb.sh_coeffs[4] = [-3.0, 0.0, 0.2];
         let linear = in_linear_light(srgb.clone());
@@ -126,7 +126,7 @@ mod tests {
     }
 
     #[test]
-    fn colours_that_turn_with_the_view_are_near_their_light_from_everywhere_and_nearer_than_any_neighbour() {
+    fn view_dependent_colours_get_the_best_fit_in_linear_light() {
         let srgb = model(3, 0.05);
         let linear = in_linear_light(srgb.clone());
         assert_eq!((linear.sh_degree, &linear.means), (3, &srgb.means));

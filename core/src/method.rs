@@ -1,7 +1,7 @@
-//! Methods: what a worker knows of a training run, whatever it trains.
+//! The interface between a worker and a training run of any method.
 //!
 //! A [`Method`] names what trains a scene; [`start`] begins a [`Run`] of it. A worker advances the run,
-//! reports progress, keeps checkpoints and takes the result, and knows nothing else of it.
+//! reports progress, keeps checkpoints and takes the result; it depends on nothing else.
 
 use std::sync::Arc;
 
@@ -18,9 +18,9 @@ pub use crate::config::Method;
 pub struct Trained {
     /// The model.
     pub gaussians: Gaussians,
-    /// Its water, where the run has one.
+    /// Its water, if the run has one.
     pub water: Option<WaterRecord>,
-    /// Steps of the water that were skipped, since a gradient was not finite.
+    /// Optimiser steps of the water that were skipped because a gradient was not finite.
     pub skipped_steps: u32,
 }
 
@@ -32,7 +32,7 @@ pub trait Run {
     /// When a photograph cannot be read or the device fails.
     fn advance(&mut self, iterations: u32) -> Result<Progress>;
 
-    /// Where the run stands; `iteration == iterations` means done.
+    /// Progress of the run; `iteration == iterations` means done.
     fn progress(&self) -> Progress;
 
     /// Everything that a resumed run needs, with a digest at its end.
@@ -41,25 +41,25 @@ pub trait Run {
     /// When the device fails.
     fn checkpoint(&mut self) -> Result<Vec<u8>>;
 
-    /// Puts the run where `checkpoint` stands.
+    /// Sets the run to the state of `checkpoint`.
     ///
     /// # Errors
-    /// [`crate::CoreError::Checkpoint`] when it is torn or belongs to another run; the run is then where it
-    /// was.
+    /// [`crate::CoreError::Checkpoint`] when it is damaged or belongs to another run; the run then keeps its
+    /// state.
     fn go_to(&mut self, checkpoint: &[u8]) -> Result<()>;
 
-    /// Measures the model on `held_out` views. `None` when there are none, or when `go_on`, which is asked
+    /// Measures the model on `held_out` views. `None` without such views, or when `go_on`, which is called
     /// before each view, returns false.
     ///
     /// # Errors
-    /// When a photograph cannot be read, or the device cannot hold the model once more.
+    /// When a photograph cannot be read, or the device cannot hold a second copy of the model.
     fn measure(
         &mut self,
         held_out: &dyn ViewSource,
         go_on: &dyn Fn() -> bool,
     ) -> Result<Option<HeldOutMetrics>>;
 
-    /// What the run has trained so far; `metres_per_unit` of 0 is unknown.
+    /// What the run has trained so far; a `metres_per_unit` of 0 means unknown.
     ///
     /// # Errors
     /// When the device fails.

@@ -1,11 +1,11 @@
-//! How near a render is to a photograph: PSNR and SSIM, and the baselines that any model must beat.
+//! Compares a render with a photograph: PSNR and SSIM, and the baselines that any model must beat.
 //!
-//! The protocol: both pictures are 8-bit sRGB; PSNR over all pixels and channels; SSIM as in 3DGS: a Gaussian
-//! window of 11 x 11 with sigma 1.5, zeros beyond the border, C1 = 0.01^2, C2 = 0.03^2, each channel on its
-//! own, the mean over pixels and channels. Pixels that the mask of the truth leaves out count in neither: for
-//! SSIM both pictures are black there and the map is not averaged there.
+//! Both pictures are 8-bit sRGB. PSNR is over all pixels and channels. SSIM is as in 3DGS: a Gaussian window
+//! of 11 x 11 with sigma 1.5, zeros beyond the border, C1 = 0.01^2, C2 = 0.03^2. It is computed for each
+//! channel and averaged over pixels and channels. Pixels that the mask of the truth leaves out count in
+//! neither: for SSIM both pictures are set to black there, and the map is not averaged there.
 //!
-//! f64 throughout and sums in a fixed order, so that a number does not depend on threads.
+//! All sums are f64 and in a fixed order, so that results do not depend on threads.
 
 use rayon::prelude::*;
 
@@ -26,7 +26,7 @@ pub fn to_8_bit(value: f32) -> u8 {
     (value * 255.0 + 0.5) as u8
 }
 
-/// A render as 8-bit pixels, all counting. `rgb` has one entry a pixel, sRGB 0..1, unclamped.
+/// A render as 8-bit pixels, all of which count. `rgb` has one entry a pixel, sRGB 0..1, unclamped.
 pub fn quantised(width: u32, height: u32, rgb: &[[f32; 3]]) -> PackedImage {
     let pixels = rgb.iter().map(|pixel| {
         let [r, g, b] = pixel.map(to_8_bit);
@@ -35,7 +35,7 @@ pub fn quantised(width: u32, height: u32, rgb: &[[f32; 3]]) -> PackedImage {
     PackedImage { width, height, pixels: pixels.collect() }
 }
 
-/// How every number of a report was taken, in words.
+/// How every number of a report was measured, in words.
 pub fn protocol() -> String {
     format!(
         "render clamped and rounded to 8 bits in sRGB; PSNR in dB, mean over views; SSIM as in 3DGS: 11 taps, sigma 1.5, zero \
@@ -47,7 +47,7 @@ pub fn protocol() -> String {
 
 /// Peak signal to noise ratio in dB over the pixels that `truth`'s mask counts; infinite for equal pictures.
 ///
-/// NaN when the sizes differ or no pixel counts: there is nothing to compare.
+/// NaN when the sizes differ or no pixel counts.
 pub fn psnr(render: &PackedImage, truth: &PackedImage) -> f64 {
     if (render.width, render.height) != (truth.width, truth.height) {
         return f64::NAN;
@@ -198,7 +198,7 @@ pub fn flat_colour(truth: &PackedImage) -> PackedImage {
 
 /// Baseline: the truth blurred by a Gaussian of sigma 15 pixels (cut at 4 sigma), over the pixels that count.
 ///
-/// It keeps colour and shading and no texture: under water, where contrast is low, it scores high.
+/// It keeps colour and shading but no texture. Under water, where contrast is low, it scores high.
 pub fn blurred(truth: &PackedImage) -> PackedImage {
     let (width, height) = (truth.width as usize, truth.height as usize);
     let window = gaussian_window((4.0 * BLUR_SIGMA) as usize, BLUR_SIGMA);

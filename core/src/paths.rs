@@ -1,15 +1,14 @@
-//! What a path that somebody else wrote may be: photographs in a manifest, files that a coordinator hands
-//! out.
+//! Checks paths from untrusted sources: photographs in a manifest, files that a coordinator sends.
 
-/// Longest path, bytes. File systems end at 255 a part and 4096 in all; no dataset comes near this.
+/// Longest path, bytes. File systems allow 255 a part and 4096 in all; no dataset comes near this limit.
 pub const MAX_PATH_BYTES: usize = 1024;
 
-/// Refuses a path that is not plainly one inside a folder, on any system: it must be relative, with `/`
-/// between its parts, none of them empty, `.` or `..`, without drives, backslashes and control characters,
-/// and of at most [`MAX_PATH_BYTES`].
+/// Refuses a path that could leave its folder on any system. It must be relative, with `/` between its parts,
+/// and no part may be empty, `.` or `..`. Drives, backslashes and control characters are refused, and so is a
+/// path over [`MAX_PATH_BYTES`].
 ///
 /// # Errors
-/// What is wrong, to go behind the path itself.
+/// What is wrong, phrased to follow the path itself.
 pub fn check_inside(path: &str) -> Result<(), String> {
     let has_drive =
         |part: &str| matches!(part.as_bytes(), [letter, b':', ..] if letter.is_ascii_alphabetic());
@@ -18,9 +17,9 @@ pub fn check_inside(path: &str) -> Result<(), String> {
     } else if path.len() > MAX_PATH_BYTES {
         return Err(format!("has {} bytes, and at most {MAX_PATH_BYTES} are allowed", path.len()));
     } else if path.chars().any(char::is_control) {
-        "holds a control character"
+        "contains a control character"
     } else if path.contains('\\') {
-        "holds a backslash; parts are divided by /"
+        "contains a backslash; separate the parts with /"
     } else if path.starts_with('/') || path.split('/').any(has_drive) {
         "is absolute; it must be relative"
     } else if path.split('/').any(|part| part == "..") {
@@ -38,7 +37,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn paths_that_leave_their_folder_on_any_system_are_refused_with_the_reason() {
+    fn paths_that_leave_their_folder_on_any_system_are_refused() {
         for (path, reason) in [
             ("", "empty"),
             ("/etc/passwd", "absolute"),
@@ -66,7 +65,7 @@ mod tests {
     }
 
     #[test]
-    fn names_that_photographs_have_are_taken() {
+    fn usual_photograph_names_are_accepted() {
         for path in
             ["a.jpg", "left cam/frame 12.JPG", "täuchung/ß.png", "a..b.png", "dive 12:30:05.jpg", "...", ".a"]
         {

@@ -1,7 +1,7 @@
-//! Random numbers as a pure function of (seed, stream, counter), so that they depend neither on
-//! threads nor on order nor on how often a run was interrupted.
+//! Random numbers as a pure function of (seed, stream, counter). They do not depend on threads, on order or
+//! on interruptions of a run.
 
-/// What a stream of random numbers is for; two purposes never share numbers.
+/// The purpose of a stream of random numbers; two purposes never share numbers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u32)]
 pub enum Stream {
@@ -17,14 +17,14 @@ pub enum Stream {
     Test = 5,
     /// Background colour of an iteration.
     Background = 6,
-    /// Where the halves of a Gaussian lie that classic density control splits; the same numbers are made in
-    /// WGSL.
+    /// Positions of the two halves when classic density control splits a Gaussian; the same numbers are made
+    /// in WGSL.
     Split = 7,
     /// First weights of the networks.
     Networks = 8,
     /// First weights of the view embeddings.
     Film = 9,
-    /// Which views an epoch has where they are not all seen alike.
+    /// Which views an epoch has if views are weighted.
     ViewSample = 10,
 }
 
@@ -91,7 +91,7 @@ mod tests {
     }
 
     #[test]
-    fn uniform_numbers_have_the_mean_and_variance_of_uniform_numbers() {
+    fn uniform_numbers_have_the_expected_mean_and_variance() {
         let n = 100_000;
         let values: Vec<f64> = (0..n).map(|i| f64::from(uniform_at(1, Stream::Test, i, i / 7))).collect();
         let mean = values.iter().sum::<f64>() / f64::from(n);

@@ -1,4 +1,4 @@
-//! What a renderer and a trainer need of photographs: pinhole, pose and packed pixels.
+//! Photographs as a renderer and a trainer need them: pinhole, pose and packed pixels.
 
 use std::sync::Arc;
 
@@ -14,8 +14,8 @@ pub struct TrainView {
     pub camera: PinholeCamera,
     /// World to camera.
     pub pose: Pose,
-    /// Range up to which there is nothing but water before it ([`crate::floaters::clear_ranges`]), scene
-    /// units; 0 where nobody knows.
+    /// Range in front of the camera that holds nothing but water ([`crate::floaters::clear_ranges`]), scene
+    /// units; 0 if unknown.
     pub clear_range: f32,
 }
 
@@ -32,18 +32,19 @@ pub struct PackedImage {
     pub pixels: Vec<u32>,
 }
 
-/// What the rays of a view end on, by cells of its picture.
+/// What the rays of a view end on, for each cell of its picture.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RayMap {
     /// Cells across.
     pub columns: u32,
     /// Cells down.
     pub rows: u32,
-    /// Row-major from the top left, `columns * rows` entries. Cell (i, j) holds the pixels whose column times
-    /// `columns` over the picture's columns is from i to below i + 1, and the same down.
+    /// Row-major from the top left, `columns * rows` entries. A pixel is in column
+    /// `floor(x * columns / width)` of the cells, where x is its column and `width` the picture's; rows
+    /// likewise.
     pub cells: Vec<EndsOn>,
-    /// Range of the sparse points that the view saw in the cell, scene units; 0 where there are none, or they
-    /// lie far behind each other.
+    /// Range of the sparse points that the view sees in the cell, scene units; 0 if there are none, or if
+    /// their ranges differ much.
     pub ranges: Vec<f32>,
     /// Distance from the colour of open water beyond which a pixel of an [`EndsOn::Edge`] cell shows a
     /// surface, sRGB, 0 to 1 a channel.
@@ -51,7 +52,7 @@ pub struct RayMap {
 }
 
 impl RayMap {
-    /// What the device reads: the answer in the two lowest bits of the range.
+    /// The map as the device reads it: [`EndsOn`] in the two lowest bits of the range.
     #[cfg(any(feature = "gpu", test))]
     pub(crate) fn packed(&self) -> Vec<u32> {
         self.cells
@@ -66,18 +67,18 @@ impl RayMap {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[repr(u32)]
 pub enum EndsOn {
-    /// Nothing tells.
+    /// Not known.
     #[default]
     Unknown = 0,
     /// A surface.
     Surface = 1,
     /// Nothing: open water.
     Open = 2,
-    /// Some on open water, the others on a surface: the colour of each pixel tells.
+    /// Some rays end on a surface and the others on nothing: the colour of each pixel decides.
     Edge = 3,
 }
 
-/// Where pixels come from: a cache on a worker, a folder, a test.
+/// Source of views and their pixels: a cache on a worker, a folder, a test.
 pub trait ViewSource: Send + Sync {
     /// All views, in the order that seeds refer to (sorted by name).
     fn views(&self) -> &[TrainView];
@@ -88,19 +89,20 @@ pub trait ViewSource: Send + Sync {
     /// When the photograph cannot be read; the message names the file.
     fn load(&self, index: usize) -> Result<Arc<PackedImage>>;
 
-    /// What the rays of view `index` end on; `None` where nobody knows.
+    /// What the rays of view `index` end on; `None` if unknown.
     fn map(&self, index: usize) -> Option<&RayMap> {
         let _ = index;
         None
     }
 
-    /// How often each view is to be seen against the others, above 0; `None` where all are seen alike.
+    /// How often each view is trained on relative to the others, above 0; `None` if all views are used
+    /// equally.
     fn weights(&self) -> Option<&[f32]> {
         None
     }
 }
 
-/// Views that are not all seen alike.
+/// Views that are trained on with different frequency.
 pub struct Weighted {
     source: Arc<dyn ViewSource>,
     weights: Vec<f32>,
@@ -115,7 +117,7 @@ impl Weighted {
         let sound = |weight: &f32| *weight > 0.0 && weight.is_finite();
         if weights.len() != source.views().len() || !weights.iter().all(sound) {
             return Err(CoreError::Config(format!(
-                "{} weights, which must be finite and above 0, for {} views",
+                "{} weights for {} views; each view needs one finite weight above 0",
                 weights.len(),
                 source.views().len()
             )));
@@ -142,7 +144,7 @@ impl ViewSource for Weighted {
     }
 }
 
-/// Views of which it is known what their rays end on.
+/// Views with a map of what their rays end on.
 pub struct Mapped {
     source: Arc<dyn ViewSource>,
     maps: Vec<RayMap>,
@@ -152,7 +154,7 @@ impl Mapped {
     /// `maps` holds one for each view of `source`.
     ///
     /// # Errors
-    /// When it does not, or a map has another number of cells than it says.
+    /// When it does not, or when a map does not hold `columns * rows` cells.
     pub fn new(source: Arc<dyn ViewSource>, maps: Vec<RayMap>) -> Result<Self> {
         let sound = |map: &RayMap| {
             let cells = u64::from(map.columns) * u64::from(map.rows);
@@ -160,7 +162,7 @@ impl Mapped {
         };
         if maps.len() != source.views().len() || !maps.iter().all(sound) {
             return Err(CoreError::Config(format!(
-                "{} maps, each with as many cells as columns times rows, for {} views",
+                "{} maps for {} views; each view needs one with columns * rows cells",
                 maps.len(),
                 source.views().len()
             )));
@@ -197,7 +199,7 @@ pub struct InMemory {
 }
 
 impl InMemory {
-    /// Every photograph all of one colour.
+    /// Photographs of a single colour.
     pub fn plain(views: Vec<TrainView>, pixel: u32) -> Self {
         let plain = |view: &TrainView| {
             let (width, height) = (view.camera.width, view.camera.height);

@@ -309,7 +309,7 @@ fn files_without_a_model_are_refused_with_a_remedy() {
     let empty = under(folder.path(), "empty.ply");
     ply::write_model(Path::new(&empty), &Gaussians::empty(3), &[]).expect("a model");
     let (_, said) = fail(&["render", &empty, "--orbit", "2"]);
-    assert!(said.contains("empty.ply") && said.contains("no Gaussian"), "{said}");
+    assert!(said.contains("empty.ply") && said.contains("no visible Gaussian"), "{said}");
     let (code, said) = fail(&["render", &empty]);
     assert!(code == 2 && said.contains("--cameras") && said.contains("--orbit"), "{said}");
     let (_, said) = fail(&["inspect", &empty, "--no-plan"]);

@@ -1,7 +1,7 @@
-//! CPU time of this process, which unlike wall time does not depend on what else the machine does.
+//! CPU time of this process, which unlike wall time does not depend on other load of the machine.
 
-/// Seconds of all threads of this process that live: to the nanosecond where Linux counts them by thread,
-/// else in hundredths, else 0.
+/// CPU seconds of all living threads of this process. The resolution is a nanosecond if Linux counts by
+/// thread, otherwise a hundredth of a second; 0 if neither is available.
 pub fn cpu_seconds() -> f64 {
     by_thread().unwrap_or_else(in_ticks)
 }
@@ -9,7 +9,7 @@ pub fn cpu_seconds() -> f64 {
 fn by_thread() -> Option<f64> {
     let mut nanoseconds = 0.0;
     for thread in std::fs::read_dir("/proc/self/task").ok()? {
-        // A thread may end between the two.
+        // A thread may end between listing and reading.
         let Ok(line) = std::fs::read_to_string(thread.ok()?.path().join("schedstat")) else { continue };
         nanoseconds += line.split_whitespace().next()?.parse::<f64>().ok()?;
     }

@@ -1,14 +1,13 @@
-//! The sort and the scan alone, as a frame records them.
+//! Measures the sort and the scan alone, recorded as in a frame.
 
 use std::error::Error;
 
 use fathom_core::gpu::{Gpu, Recorder, Scan, Size, Sort, counter};
 use fathom_core::rng::{Stream, random_bits};
 
-/// Bits of the keys: as many as a depth has.
+/// Bits of the keys, as many as a depth has.
 pub const KEY_BITS: u32 = 30;
-/// Buffers for one sort or scan of `n` entries; `check` says whether what was last recorded did what it
-/// should.
+/// Buffers for one sort or scan of `n` entries; `check` verifies the last result.
 pub struct Primitives<'g> {
     gpu: &'g Gpu,
     n: u32,
@@ -18,7 +17,7 @@ pub struct Primitives<'g> {
     scan: Scan,
 }
 
-/// What is measured alone.
+/// The primitive to measure.
 #[derive(Clone, Copy, PartialEq)]
 pub enum Primitive {
     /// Keys of [`KEY_BITS`] bits with a value each.
@@ -41,7 +40,7 @@ impl Primitive {
         let each = match self {
             // Counting reads the keys; scattering reads and writes keys and values.
             Self::Sort => KEY_BITS.div_ceil(Sort::PASS_BITS) * 20,
-            // One reading for the sums of the chunks; one and a writing for the result.
+            // One read for the sums of the chunks; one read and one write for the result.
             Self::Scan => 12,
         };
         u64::from(each) * u64::from(n)
@@ -65,7 +64,7 @@ impl<'g> Primitives<'g> {
         })
     }
 
-    /// Puts the input back: random keys, small counts.
+    /// Restores the input: random keys, small counts.
     pub fn refill(&self, primitive: Primitive) -> fathom_core::Result<()> {
         let ids: Vec<u32> = (0..self.n).collect();
         match primitive {
@@ -96,7 +95,7 @@ impl<'g> Primitives<'g> {
         }
     }
 
-    /// So that nothing is measured that does not do its work.
+    /// Fails if the result is wrong.
     pub fn check(&self, primitive: Primitive) -> Result<(), Box<dyn Error>> {
         let read = |buffer: &wgpu::Buffer| self.gpu.read::<u32>(buffer, 0, self.n as usize);
         let right = match primitive {

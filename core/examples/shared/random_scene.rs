@@ -1,10 +1,15 @@
-//! The random scene of the benchmarks: a written formula and a seed, so that it is the same everywhere.
+//! The random scene of the benchmarks, defined by a formula and a seed so that it is the same everywhere.
 //!
-//! Gaussian i of n, with u_k = `uniform_at(1, Test, i, k)` in (0, 1]: depth z = 2 + 4 u_2, mean (1.1 (u_0 -
-//! 1/2) z, 0.65 (u_1 - 1/2) z, z), quaternion u_3..u_6 - 1/2, log scales s + 1.5 u_7..u_9, logit -3 + 5 u_10,
-//! coefficient k of channel c: u_(20 + 20 c + k) - 1/2. The camera stands at the origin and looks along z,
-//! focal length 0.9 of the width, so that a picture of 16:9 sees all of them. s is -4.2 for up to 30,000
-//! Gaussians, and falls with n so that they cover the same area together: s = -4.2 - ln(n / 30,000) / 2.
+//! With u_k = `uniform_at(1, Test, i, k)` in [0, 1), Gaussian i of n has:
+//! - depth `z = 2 + 4 u_2` and mean `(1.1 (u_0 - 1/2) z, 0.65 (u_1 - 1/2) z, z)`;
+//! - quaternion `u_3..u_6 - 1/2`;
+//! - log scales `s + 1.5 u_7..u_9` with `s = -4.2 - max(0, ln(n / 30,000) / 2)`, so that more than 30,000
+//!   Gaussians cover the same area together;
+//! - opacity logit `-3 + 5 u_10`;
+//! - coefficient k of channel c: `u_(20 + 20 c + k) - 1/2`.
+//!
+//! The camera is at the origin and looks along z. Its focal length is 0.9 of the width, so that a picture of
+//! 16:9 shows all Gaussians.
 
 use fathom_core::gaussians::Gaussians;
 use fathom_core::rng::{Stream, uniform_at};
@@ -27,7 +32,7 @@ pub fn model(n: u32) -> Gaussians {
     model
 }
 
-/// The camera that sees all of it.
+/// The camera that sees all Gaussians.
 pub fn camera(width: u32, height: u32) -> (PinholeCamera, Pose) {
     let focal = 0.9 * f64::from(width);
     let camera = PinholeCamera {

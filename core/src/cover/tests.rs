@@ -32,7 +32,7 @@ fn points(positions: &[[f64; 3]]) -> Points {
     points
 }
 
-/// Points of tracks.
+/// Points with tracks.
 fn tracked(positions: &[([f64; 3], &[u32])]) -> Points {
     let mut points = Points::default();
     for (position, track) in positions {
@@ -46,7 +46,7 @@ fn grey(code: u8) -> PackedImage {
     PackedImage { width: SIDE, height: SIDE, pixels: vec![pixel; PIXELS] }
 }
 
-/// A picture whose mask holds where the column is one of these.
+/// A picture whose mask is set in these columns.
 fn masked(image: PackedImage, columns: std::ops::Range<usize>) -> PackedImage {
     let masked = |(index, pixel): (usize, u32)| {
         if columns.contains(&(index % 100)) { pixel } else { pixel & 0x00ff_ffff }
@@ -54,7 +54,7 @@ fn masked(image: PackedImage, columns: std::ops::Range<usize>) -> PackedImage {
     PackedImage { pixels: image.pixels.into_iter().enumerate().map(masked).collect(), ..image }
 }
 
-/// What the model shows of view 0: a wall, but for holes.
+/// The render of view 0: a wall with holes.
 struct Shown {
     alpha: Vec<f32>,
     range: Vec<f32>,
@@ -97,7 +97,7 @@ impl Shown {
 }
 
 #[test]
-fn pixels_are_covered_within_a_hundredth_of_the_picture_around_points_and_not_beyond() {
+fn points_cover_pixels_within_a_hundredth_of_the_picture() {
     // A radius of one pixel: the pixel of the point and the four beside it.
     let covered = discs(&camera(), &[[20.5, 30.5]]);
     let at: Vec<(usize, usize)> =
@@ -120,7 +120,7 @@ fn holes_are_covered_pixels_that_the_model_leaves_open() {
     let hole = |x, y| if (x, y) == (30, 50) || x > 90 { 0.89 } else { 0.95 };
     let shown = Shown::wall(hole);
     assert_eq!(shown.measured(&views, &points).holes, Some(1.0 / 6.0), "one of six covered pixels");
-    // NaN is no surface.
+    // NaN does not count as a surface.
     let broken = Shown { alpha: vec![f32::NAN; PIXELS], ..shown };
     assert_eq!(broken.measured(&views, &points).holes, Some(1.0));
 }
@@ -132,13 +132,13 @@ fn a_point_that_only_one_training_view_sees_covers_nothing() {
     // From x = 3 the picture begins at pixel 30 of the held-out view.
     assert_eq!(open.measured(&views(&[0.0, 3.0]), &points(&left)).holes, None);
     assert_eq!(open.measured(&views(&[0.0, 0.1]), &points(&left)).holes, Some(1.0));
-    // Tracks say it where there are any; the held-out view itself does not count.
+    // Tracks decide if there are any; the held-out view itself does not count.
     let seen = |track: &[u32]| open.measured(&views(&[0.0, 0.1]), &tracked(&[(left[0], track)])).holes;
     assert_eq!([seen(&[0, 1]), seen(&[0, 1, 2])], [None, Some(1.0)]);
 }
 
 #[test]
-fn a_place_that_fewer_than_two_training_views_show_is_unseen() {
+fn positions_in_fewer_than_two_training_views_are_unseen() {
     let wall = Shown::wall(|x, _| if x < 20 { 0.5 } else { 1.0 });
     let unseen = |training: &[f64]| wall.measured(&views(training), &Points::default()).unseen;
     // The picture from x = 3 begins at pixel 30 of the held-out view; 20 columns are no surface.
@@ -151,7 +151,7 @@ fn a_place_that_fewer_than_two_training_views_show_is_unseen() {
 }
 
 #[test]
-fn a_camera_that_looks_away_sees_nothing_of_what_is_behind_it() {
+fn a_camera_sees_nothing_behind_it() {
     let mut views = views(&[0.0, 0.0]);
     views[2].1 = Pose::looking_at(DVec3::ZERO, -DVec3::Z, DVec3::Y);
     let wall = Shown::wall(|_, _| 1.0);
@@ -164,7 +164,7 @@ fn light_left_in_open_water_is_a_share_of_the_white_of_j() {
     let mut shown = Shown::wall(|x, _| if x < 40 { 0.1 } else { 1.0 });
     assert_eq!(shown.measured(&views, &Points::default()).open_water, None, "no medium");
     let mut clear = grey(200);
-    // Half a percent of highlights is no white; open water is dim.
+    // Half a percent of highlights must not count as white; open water is dim.
     for (pixel, value) in clear.pixels.iter_mut().enumerate() {
         match (pixel % 100, pixel / 100) {
             (..40, _) => *value = u32::from_le_bytes([0, 0, 100, 255]),
@@ -204,15 +204,14 @@ fn the_white_of_j_is_that_of_all_views_together() {
 }
 
 #[test]
-fn where_a_truth_says_what_is_open_the_model_is_not_asked() {
+fn a_truth_decides_what_is_open_instead_of_the_model() {
     let views = views(&[0.0, 0.0]);
-    // The truth has surfaces from column 50 on. The model hangs light into the water, and has a hole in the
-    // surface.
+    // The truth has surfaces from column 50 on. The model has light in open water, and a hole in the surface.
     let mut shown = Shown::wall(|x, _| if (70..80).contains(&x) { 0.1 } else { 1.0 });
     shown.truth = Some(masked(grey(0), 50..100));
     let mut clear = grey(200);
     for (pixel, value) in clear.pixels.iter_mut().enumerate() {
-        // Beside the border of the surface light is nobody's fault.
+        // Light beside the border of the surface does not count.
         if pixel % 100 < 49 {
             *value = u32::from_le_bytes([100, 100, 100, 255]);
         }
@@ -222,8 +221,8 @@ fn where_a_truth_says_what_is_open_the_model_is_not_asked() {
     let found = shown.measured(&views, &points);
     let expected = srgb_to_linear(100.0 / 255.0) / srgb_to_linear(200.0 / 255.0);
     assert!(found.open_water.is_some_and(|light| (light - expected).abs() < 1e-12), "{found:?}");
-    // A disc of 10 pixels around the point, on a grid of every second: all of the hole's columns, and as many
-    // pixels beside.
+    // A disc of 10 pixels around the point, on a grid of every second pixel. It covers all columns of the
+    // hole and as many beside it.
     let inside = |half: f64| {
         (0..PIXELS).filter(move |pixel| {
             let (x, y) = ((pixel % 100) as f64 + 0.5 - 75.5, (pixel / 100) as f64 + 0.5 - 50.5);
@@ -249,27 +248,27 @@ fn pixels_that_the_mask_leaves_out_count_nowhere() {
 }
 
 #[test]
-fn what_will_be_unseen_is_foretold_by_sparse_points() {
+fn sparse_points_predict_what_will_be_unseen() {
     // Points in every tenth column and row: each pixel has one within 1/10.
     let lattice: Vec<[f64; 3]> = (0..100)
         .map(|i| on_wall(f64::from(i % 10).mul_add(10.0, 5.5), f64::from(i / 10).mul_add(10.0, 5.5)))
         .collect();
     let cloud = points(&lattice);
-    let foretold = predicted_unseen(&views(&[0.0, 3.0]), &[0], &cloud).expect("points are near");
+    let predicted = predicted_unseen(&views(&[0.0, 3.0]), &[0], &cloud).expect("points are near");
     // The lattice lies on a wall, whose range differs between a pixel and its point by at most a few percent.
-    assert!((foretold - 0.3).abs() < 0.02, "{foretold}");
+    assert!((predicted - 0.3).abs() < 0.02, "{predicted}");
     assert_eq!(predicted_unseen(&views(&[0.0, 0.0]), &[0], &cloud), Some(0.0));
     assert_eq!(predicted_unseen(&views(&[0.0, 0.0]), &[0], &Points::default()), None);
     assert_eq!(predicted_unseen(&views(&[]), &[0], &cloud), None);
     assert_eq!(predicted_unseen(&views(&[0.0, 0.0]), &[], &cloud), None);
-    // With tracks only the points that the view sees say how far away it looks, and only near them.
+    // With tracks, only points that the view sees give a range, and only near them.
     let seen = tracked(&[(on_wall(15.5, 50.5), &[0, 1]), (on_wall(85.5, 50.5), &[1, 2])]);
     assert_eq!(predicted_unseen(&views(&[0.0, 3.0]), &[0], &seen), Some(1.0));
     assert_eq!(predicted_unseen(&views(&[0.0, 0.0]), &[0], &seen), Some(0.0));
 }
 
 #[test]
-fn a_grid_is_even_and_has_a_bound_whatever_the_picture() {
+fn a_grid_is_even_and_bounded_for_any_picture() {
     for (width, height) in [(1, 1), (64, 64), (65, 64), (1600, 1200), (65_535, 1), (3, 65_535), (4096, 4096)]
     {
         let camera = camera().resized(width, height);
@@ -283,7 +282,7 @@ fn a_grid_is_even_and_has_a_bound_whatever_the_picture() {
 }
 
 #[test]
-fn the_nearest_views_are_asked_first() {
+fn the_nearest_views_come_first() {
     let points = Points::default();
     let trained = Trained::new(&views(&[5.0, -1.0, 2.0]), &[0], &points);
     let near: Vec<f64> = trained.near(DVec3::ZERO).iter().map(|eye| eye.centre.x).collect();
@@ -291,7 +290,7 @@ fn the_nearest_views_are_asked_first() {
 }
 
 #[test]
-fn a_report_stands_in_metrics_beside_its_views_and_one_without_these_numbers_is_read() {
+fn a_report_goes_into_metrics_and_old_reports_are_read() {
     let view = |holes| ViewCover { holes: Some(holes), open_water: None, unseen: Some(0.5) };
     let report = CoverReport { all: view(0.25), views: vec![view(0.0), view(0.5)] };
     let mut metrics = json!({ "psnr": 30.0, "views": [{ "name": "a" }, { "name": "b" }] });

@@ -1,4 +1,4 @@
-//! The sRGB curve (IEC 61966-2-1), exact to the last code and without a power function per pixel.
+//! The sRGB curve (IEC 61966-2-1), exact for every code and without a power function per pixel.
 
 use std::sync::LazyLock;
 
@@ -27,13 +27,13 @@ pub(super) static LINEAR_OF_16: LazyLock<Vec<f32>> =
 
 /// Rounds linear light to 8-bit sRGB codes.
 pub(super) struct Encoder {
-    /// The least linear light that rounds to each code; code 0 starts below every value.
+    /// The smallest linear light that rounds to each code; code 0 starts below every value.
     starts: Vec<f32>,
-    /// The code at each of evenly spaced values: where the search starts.
+    /// The code at each of evenly spaced values, where the search starts.
     first: Vec<u8>,
 }
 
-/// Steps of [`Encoder::first`]; with 4096 the search advances by at most one code but near black.
+/// Steps of [`Encoder::first`]; with 4096 the search advances by at most one code, except near black.
 const STEPS: usize = 4096;
 
 pub(super) static ENCODER: LazyLock<Encoder> = LazyLock::new(|| {
@@ -52,7 +52,7 @@ pub(super) static ENCODER: LazyLock<Encoder> = LazyLock::new(|| {
 });
 
 impl Encoder {
-    /// The code whose value is nearest in sRGB; values outside 0..1 are clamped, NaN gives 0.
+    /// The code nearest in sRGB; values outside 0..1 are clamped, NaN gives 0.
     pub fn code(&self, linear: f32) -> u8 {
         // The cast of NaN and of negative values gives 0.
         let step = ((linear * STEPS as f32) as usize).min(STEPS - 1);

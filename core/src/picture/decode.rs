@@ -1,4 +1,4 @@
-//! From the bytes of a picture file to samples, strictly: what is torn or strange is an error with its name.
+//! Decodes picture files strictly: damaged or unusual files give an error that names the photograph.
 
 use std::io::Cursor;
 
@@ -9,10 +9,10 @@ use super::header::{Format, UNKNOWN_FORMAT, check_jpeg_end, dimensions_of};
 use crate::config::MaskKeep;
 use crate::{CoreError, Result};
 
-/// A decoded photograph with its mask, in the camera it was taken with.
+/// A decoded photograph with its mask, before undistortion.
 pub(super) struct Photo {
     image: DynamicImage,
-    /// One entry a pixel, whether it counts; `None` where all do.
+    /// Whether each pixel counts; `None` if all do.
     keep: Option<Vec<bool>>,
 }
 
@@ -31,7 +31,7 @@ impl Photo {
         Ok(Self { image, keep: None })
     }
 
-    /// Lays a mask over the photograph. A mask of another size but the same shape is stretched to it.
+    /// Applies a mask to the photograph. A mask of another size but the same aspect ratio is stretched to it.
     pub fn apply_mask(&mut self, name: &str, bytes: &[u8], keep: MaskKeep) -> Result<()> {
         let (width, height) = self.size();
         let mask = decode(name, bytes, |size| mask_mismatch(size, (width, height)))?.into_luma8();
@@ -55,7 +55,7 @@ impl Photo {
         (self.image.width(), self.image.height())
     }
 
-    /// Linear RGB and 1 where the pixel counts; all 0 where its mask or its transparency leaves it out.
+    /// Linear RGB and 1 if the pixel counts; all 0 if its mask or its transparency leaves it out.
     pub fn linear(&self, x: usize, y: usize) -> [f32; 4] {
         let at = y * self.image.width() as usize + x;
         if self.keep.as_ref().is_some_and(|keep| !keep[at]) {
@@ -90,7 +90,7 @@ impl Photo {
                 let [r, g, b, alpha] = array(&image.as_raw()[at * 4..]);
                 opaque(alpha >= 32_768, [lut16(r), lut16(g), lut16(b), 1.0])
             }
-            // `decode` lets only the kinds above through.
+            // `decode` refuses all other kinds.
             _ => [0.0; 4],
         }
     }
@@ -108,8 +108,7 @@ fn array<T: Copy, const N: usize>(samples: &[T]) -> [T; N] {
     std::array::from_fn(|index| samples[index])
 }
 
-/// Decodes PNG, JPEG or TIFF of a size that `mismatch` has nothing against; it is asked before anything is
-/// allocated.
+/// Decodes PNG, JPEG or TIFF. `mismatch` checks the size before anything is allocated.
 fn decode(
     name: &str,
     bytes: &[u8],
@@ -131,7 +130,7 @@ fn decode(
     };
     let mut reader = image::ImageReader::with_format(Cursor::new(bytes), format);
     let mut limits = image::Limits::default();
-    // Four 16-bit channels twice (the picture and what the decoder works in), and room for small ones.
+    // Four 16-bit channels twice (the picture and the decoder's buffers), and a margin for small pictures.
     limits.max_alloc = Some(u64::from(size.0) * u64::from(size.1) * 16 + (64 << 20));
     reader.limits(limits);
     reader.decode().map_err(|error| {
@@ -139,7 +138,7 @@ fn decode(
     })
 }
 
-/// What is wrong when a picture of size `found` belongs to a camera of size `expected`.
+/// The message for a picture of size `found` whose camera has size `expected`; `None` if they are equal.
 pub(crate) fn size_mismatch(found: (u32, u32), expected: (u32, u32)) -> Option<String> {
     if found == expected {
         return None;
@@ -154,11 +153,12 @@ pub(crate) fn size_mismatch(found: (u32, u32), expected: (u32, u32)) -> Option<S
     Some(format!("the picture is {width}x{height}, but its camera is {camera_width}x{camera_height}; {help}"))
 }
 
-/// What is wrong when a mask of size `found` belongs to a photograph of size `photograph`.
+/// The message for a mask of size `found` that does not fit a photograph of size `photograph`; `None` if it
+/// fits.
 fn mask_mismatch(found: (u32, u32), photograph: (u32, u32)) -> Option<String> {
-    // Masks are often made at a rounded fraction of the size; a hundredth covers the rounding.
+    // Masks often have a rounded fraction of the size; one percent covers the rounding.
     const SHAPE_TOLERANCE: f64 = 0.01;
-    // More pixels than this are no mask of this photograph, and decoding them could exhaust the memory.
+    // A larger mask cannot belong to this photograph, and decoding it could exhaust the memory.
     const MAX_SCALE: f64 = 4.0;
     let scale = [(found.0, photograph.0), (found.1, photograph.1)]
         .map(|(mask, picture)| f64::from(mask) / f64::from(picture));

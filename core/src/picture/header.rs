@@ -1,6 +1,6 @@
-//! What a picture file says about itself before anything is decoded: format, size, completeness.
+//! Format, size and completeness of a picture file, from its header.
 //!
-//! Ingest asks this of thousands of photographs, so only the bytes in front of the pixels are read.
+//! Ingest checks thousands of photographs, so only the bytes before the pixels are read.
 
 use std::fs::File;
 use std::io::{BufReader, Read, Seek, SeekFrom};
@@ -18,7 +18,7 @@ pub(super) enum Format {
 }
 
 impl Format {
-    /// By the first bytes; the name of a file is not believed.
+    /// The format by the first bytes; the file name is ignored.
     pub fn of(start: &[u8]) -> Option<Self> {
         match start {
             [0x89, b'P', b'N', b'G', 0x0D, 0x0A, 0x1A, 0x0A, ..] => Some(Self::Png),
@@ -32,25 +32,24 @@ impl Format {
 pub(super) const UNKNOWN_FORMAT: &str =
     "is not a PNG, JPEG or TIFF file (by its first bytes); convert it to one of these";
 
-/// Most pixels of a picture. The largest cameras have 150 million; at 16 bits and four channels these take 2
-/// GiB, and as much again while they are decoded. A file of a few kB can announce any number.
+/// Most pixels of a picture. The largest cameras have 150 million. At 16 bits and four channels, the most
+/// pixels take 2 GiB, and as much again during decoding. A file of a few kB can declare any number.
 pub(super) const MAX_PIXELS: u64 = 1 << 28;
 
-/// Most scans of a JPEG. Progressive ones have ten or so, and each one goes over all pixels: a file of 1 MB
-/// could hold so many that decoding it takes hours. The bound of libjpeg-turbo's own tests.
+/// Most scans of a JPEG. Progressive files have about ten, and each scan covers all pixels: a file of 1 MB
+/// could hold so many that decoding takes hours. The limit is that of libjpeg-turbo's own tests.
 const MAX_SCANS: usize = 500;
 
-/// Columns and rows of the picture in a file, by its header only.
+/// Columns and rows of a picture, from the header of its file.
 ///
 /// # Errors
-/// When the file cannot be read, is of another format, ends inside its header, or says that it has more
-/// pixels than are read.
+/// When the file cannot be read, has another format, ends inside its header, or declares too many pixels.
 pub fn dimensions(path: &Path) -> Result<(u32, u32)> {
     let mut file = BufReader::new(File::open(path).map_err(CoreError::io("read", path))?);
     dimensions_of(&mut file).map_err(|message| CoreError::input(path, message))
 }
 
-/// As [`dimensions`], and makes sure that a JPEG is not cut off before its end marker.
+/// As [`dimensions`], and checks that a JPEG has its end marker.
 ///
 /// # Errors
 /// As [`dimensions`], and when the JPEG is truncated.
@@ -63,7 +62,7 @@ pub fn dimensions_of_complete(path: &Path) -> Result<(u32, u32)> {
     if Format::of(&start) != Some(Format::Jpeg) {
         return Ok(size);
     }
-    // An end marker near the end is what nearly every complete file has; else the whole file is walked.
+    // Nearly every complete file has its end marker near the end; otherwise the whole file is scanned.
     const TAIL: u64 = 4096;
     let len = file.metadata().map_err(io())?.len();
     file.seek(SeekFrom::Start(len.saturating_sub(TAIL))).map_err(io())?;
@@ -76,7 +75,7 @@ pub fn dimensions_of_complete(path: &Path) -> Result<(u32, u32)> {
     Ok(size)
 }
 
-/// Columns and rows; the message says what is wrong without naming the file.
+/// Columns and rows; the error message does not name the file.
 pub(super) fn dimensions_of<R: Read + Seek>(file: &mut R) -> Result<(u32, u32), String> {
     let unreadable = |error: std::io::Error| {
         if error.kind() == std::io::ErrorKind::UnexpectedEof {
@@ -109,19 +108,19 @@ pub(super) fn dimensions_of<R: Read + Seek>(file: &mut R) -> Result<(u32, u32), 
     if u64::from(size.0) * u64::from(size.1) > MAX_PIXELS {
         let (width, height) = size;
         return Err(format!(
-            "the picture says that it has {width}x{height} pixels, and at most {} million are read; reduce it, or cut it \
-             into several with a camera each",
+            "the picture declares {width}x{height} pixels; the limit is {} million; reduce it, or cut it into several with \
+             a camera each",
             MAX_PIXELS / 1_000_000
         ));
     }
     Ok(size)
 }
 
-/// Walks the segments of a JPEG to its frame header, from behind the first marker.
+/// Walks the segments of a JPEG to its frame header, starting after the first marker.
 fn jpeg_dimensions<R: Read + Seek>(file: &mut R) -> std::io::Result<Option<(u32, u32)>> {
     let mut byte = [0; 1];
     loop {
-        // Between segments stand a 0xFF, any number of further ones, and the marker.
+        // A segment starts with one or more bytes 0xFF and the marker.
         file.read_exact(&mut byte)?;
         if byte[0] != 0xFF {
             return Ok(None);
@@ -151,13 +150,13 @@ fn jpeg_dimensions<R: Read + Seek>(file: &mut R) -> std::io::Result<Option<(u32,
     }
 }
 
-/// SOF0 to SOF15 but DHT, JPG and DAC, which lie among them.
+/// SOF0 to SOF15, without DHT, JPG and DAC, whose numbers lie among them.
 fn is_frame_header(marker: u8) -> bool {
     matches!(marker, 0xC0..=0xCF) && !matches!(marker, 0xC4 | 0xC8 | 0xCC)
 }
 
-/// Walks a whole JPEG to its end marker, and counts its scans. Decoders fill what is missing with grey and
-/// say nothing, and grey photographs would be trained.
+/// Walks a whole JPEG to its end marker and counts its scans. Decoders fill missing pixels with grey without
+/// an error, and training would use that grey.
 pub(super) fn check_jpeg_end(bytes: &[u8]) -> Result<(), String> {
     let truncated = || {
         format!(
@@ -167,7 +166,7 @@ pub(super) fn check_jpeg_end(bytes: &[u8]) -> Result<(), String> {
     };
     let (mut at, mut scans) = (2, 0);
     loop {
-        // To the next marker. Inside the pixels 0xFF00 is a stuffed byte and 0xFFD0..D7 are restarts.
+        // Finds the next marker. Inside the pixels, 0xFF00 is a stuffed byte and 0xFFD0..D7 are restarts.
         let start = bytes.get(at..).unwrap_or_default();
         let step = start
             .windows(2)

@@ -1,7 +1,7 @@
-//! Photographs as training takes them: decoded, undistorted, masked, reduced, packed.
+//! Prepares photographs for training: decodes, undistorts, masks, reduces and packs them.
 //!
-//! Everything works on bytes, because a worker has blobs and no paths; names are for messages. All mixing of
-//! pixels happens in linear light, and nothing depends on threads: the same bytes in give the same bytes out.
+//! Everything works on bytes, because a worker has blobs and no paths; names are for messages. Pixels are
+//! only mixed in linear light. Results do not depend on threads: equal input bytes give equal output bytes.
 
 mod colour;
 mod decode;
@@ -24,32 +24,33 @@ use crate::{CoreError, Result};
 use decode::Photo;
 use resample::{Undistorted, reduce};
 
-/// A photograph as it was handed in.
+/// A photograph before preparation.
 #[derive(Clone, Copy, Debug)]
 pub struct Photograph<'a> {
     /// Its name, for messages.
     pub name: &'a str,
     /// The bytes of its PNG, JPEG or TIFF file.
     pub image: &'a [u8],
-    /// The bytes of its mask, of the same shape.
+    /// The bytes of its mask, which has the same aspect ratio.
     pub mask: Option<&'a [u8]>,
 }
 
-/// The camera of the pixels that [`prepare`] gives, without any picture.
+/// The camera of the pixels that [`prepare`] returns, computed without a picture.
 ///
 /// # Errors
-/// When the camera model is one that Fathom does not undistort.
+/// When Fathom cannot undistort the camera model.
 pub fn prepared_camera(camera: &Camera, max_resolution: u32) -> Result<PinholeCamera> {
     Ok(camera.pinhole()?.fitted(max_resolution))
 }
 
 /// Decodes, undistorts, masks and reduces a photograph so that its longest side is at most `max_resolution`.
 ///
-/// Transparent pixels (alpha below one half) never count; `mask_keep` says which side of a mask file does.
+/// Transparent pixels (alpha below one half) never count; `mask_keep` says whether the white or the black
+/// pixels of a mask file count.
 ///
 /// # Errors
-/// When the camera model cannot be undistorted, when a file is torn, of an unknown format or of another size
-/// than its camera; the message names the photograph.
+/// When the camera model cannot be undistorted, or when a file is damaged, has an unknown format or another
+/// size than its camera; the message names the photograph.
 pub fn prepare(
     photograph: &Photograph<'_>,
     camera: &Camera,
@@ -84,13 +85,13 @@ pub fn half(image: &PackedImage) -> PackedImage {
 }
 
 impl PackedImage {
-    /// From 8-bit RGB, every pixel counting. `rgb` has `width * height * 3` entries.
+    /// From 8-bit RGB; every pixel counts. `rgb` has `width * height * 3` entries.
     pub fn from_rgb8(width: u32, height: u32, rgb: &[u8]) -> Self {
         let pixels = rgb.chunks_exact(3).map(|p| u32::from_le_bytes([p[0], p[1], p[2], 255])).collect();
         Self { width, height, pixels }
     }
 
-    /// 8-bit RGB, three bytes a pixel; masked pixels as they are stored.
+    /// 8-bit RGB, three bytes a pixel; masked pixels keep their stored colour.
     pub fn to_rgb8(&self) -> Vec<u8> {
         self.pixels
             .iter()
@@ -101,7 +102,7 @@ impl PackedImage {
             .collect()
     }
 
-    /// Which share of the pixels counts, 0 to 1.
+    /// The share of pixels that count, 0 to 1.
     pub fn kept_share(&self) -> f64 {
         let kept = self.pixels.iter().filter(|pixel| pixel.to_le_bytes()[3] == 255).count();
         kept as f64 / self.pixels.len().max(1) as f64
@@ -111,7 +112,7 @@ impl PackedImage {
 /// A PNG of 8-bit RGB pixels, three bytes each.
 ///
 /// # Errors
-/// When `rgb` is not of the size that `width` and `height` say.
+/// When `rgb` does not have `width * height * 3` bytes.
 pub fn encode_png(width: u32, height: u32, rgb: &[u8]) -> Result<Vec<u8>> {
     encode(width, height, rgb, image::ExtendedColorType::Rgb8)
 }
@@ -119,7 +120,7 @@ pub fn encode_png(width: u32, height: u32, rgb: &[u8]) -> Result<Vec<u8>> {
 /// A PNG of 8-bit grey pixels, one byte each.
 ///
 /// # Errors
-/// When `grey` is not of the size that `width` and `height` say.
+/// When `grey` does not have `width * height` bytes.
 pub fn encode_grey_png(width: u32, height: u32, grey: &[u8]) -> Result<Vec<u8>> {
     encode(width, height, grey, image::ExtendedColorType::L8)
 }

@@ -1,12 +1,12 @@
-//! NumPy's file of one array (format 1.0 of `numpy.lib.format`).
+//! Writes NumPy's file of one array (format 1.0 of `numpy.lib.format`).
 
-/// An f32 array [height, width] as the bytes of an `.npy`: `numpy.load` reads them; without NumPy, 128 bytes
-/// of header and then little-endian f32, row-major. `values` has `width * height` entries.
+/// An f32 array [height, width] as the bytes of an `.npy` file for `numpy.load`: 128 bytes of header, then
+/// little-endian f32, row-major. `values` has `width * height` entries.
 pub fn encode_npy(width: u32, height: u32, values: &[f32]) -> Vec<u8> {
     debug_assert_eq!(values.len() as u64, u64::from(width) * u64::from(height));
     let fields = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': ({height}, {width}), }}");
-    // Magic, version 1.0, and the length of what follows; padded so that the numbers begin at a multiple
-    // of 64.
+    // Magic, version 1.0 and the length of the rest of the header, which is padded so that the values begin
+    // at a multiple of 64.
     let mut npy = b"\x93NUMPY\x01\x00\x76\x00".to_vec();
     npy.extend_from_slice(format!("{fields:<117}\n").as_bytes());
     npy.reserve(4 * values.len());

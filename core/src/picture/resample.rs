@@ -1,9 +1,8 @@
-//! Making pictures smaller: the exact area average in linear light.
+//! Reduces pictures by the exact area average in linear light.
 //!
-//! Every output pixel is the mean of the source pixels under it, weighted by the area they share, over the
-//! pixels that count. Rows of the source are asked for when they are needed, so undistortion runs inside the
-//! same pass and no full-size copy in floats exists. Plain f32 in a fixed order: the same bytes on every
-//! machine.
+//! Every output pixel is the mean of the source pixels under it that count, weighted by the shared area.
+//! Source rows are computed when they are needed, so undistortion runs in the same pass and there is no
+//! full-size copy in floats. Sums are plain f32 in a fixed order and give the same bytes on every machine.
 
 use rayon::prelude::*;
 
@@ -32,7 +31,7 @@ impl Rows for Photo {
     }
 }
 
-/// A photograph as its pinhole camera would have taken it, bilinear in linear light.
+/// A photograph resampled to its pinhole camera, bilinear in linear light.
 pub(super) struct Undistorted<'a> {
     pub photo: &'a Photo,
     pub undistortion: Undistortion,
@@ -93,9 +92,9 @@ impl Rows for PackedImage {
     }
 }
 
-/// The source at `width` x `height`, neither larger than its own size.
+/// The source at `width` x `height`, which must not exceed its own size.
 ///
-/// A pixel counts when at least half of its area does; what does not count is black with mask 0.
+/// A pixel counts if at least half of its area does; others are black with mask 0.
 pub(super) fn reduce(source: &impl Rows, width: u32, height: u32) -> PackedImage {
     let (source_width, source_height) = source.size();
     debug_assert!(width <= source_width && height <= source_height);
@@ -145,7 +144,7 @@ struct Span {
 
 impl Span {
     fn new(index: u32, len: u32, source_len: u32) -> Self {
-        // In integers up to the one division, so that neighbours share their border exactly.
+        // In integers up to the single division, so that neighbours share their border exactly.
         let border = |at: u32| (u64::from(at) * u64::from(source_len)) as f64 / f64::from(len);
         Self { start: border(index), end: border(index + 1) }
     }
@@ -154,7 +153,7 @@ impl Span {
         (self.end - self.start) as f32
     }
 
-    /// Each pixel with the share of it that lies inside.
+    /// Each pixel with the share of its length inside the span.
     fn weights(&self) -> impl Iterator<Item = (u32, f32)> {
         let (start, end) = (self.start, self.end);
         (start.floor() as u32..end.ceil() as u32).map(move |at| {

@@ -24,7 +24,7 @@ fn rgb_test_picture(width: u32, height: u32) -> ImageBuffer<Rgb<u8>, Vec<u8>> {
 }
 
 #[test]
-fn a_picture_that_needs_nothing_keeps_every_byte() {
+fn a_picture_that_needs_no_change_keeps_every_byte() {
     let picture = rgb_test_picture(13, 9);
     for format in [ImageFormat::Png, ImageFormat::Tiff] {
         let bytes = file(picture.clone(), format);
@@ -61,7 +61,7 @@ fn every_kind_of_samples_gives_the_same_picture() {
         for picture in [grey(bits16, alpha), colour(bits16, alpha)] {
             let kind = picture.color();
             let mut formats = vec![ImageFormat::Png];
-            // The encoder writes no TIFF of grey with alpha.
+            // The encoder cannot write a TIFF of grey with alpha.
             if !(alpha && kind.channel_count() == 2) {
                 formats.push(ImageFormat::Tiff);
             }
@@ -118,7 +118,7 @@ fn halves_of_odd_pictures_keep_a_constant_and_the_mean_light() {
 }
 
 #[test]
-fn a_mask_keeps_white_or_black_and_transparent_pixels_never_count() {
+fn a_mask_keeps_white_or_black_and_never_transparent_pixels() {
     let picture = ImageBuffer::from_fn(8, 4, |x, _| Rgba([200_u8, 100, 50, if x < 2 { 0 } else { 255 }]));
     let mask = ImageBuffer::from_fn(8, 4, |_, y| Luma([if y < 2 { 0_u8 } else { 255 }]));
     let (picture, mask) = (file(picture, ImageFormat::Png), file(mask, ImageFormat::Png));
@@ -161,7 +161,7 @@ fn a_smaller_mask_is_stretched_and_one_of_another_shape_refused() {
     let square: ImageBuffer<Luma<u8>, _> = ImageBuffer::new(4, 4);
     let error = prepare_at(&picture, Some(&file(square, ImageFormat::Png)), &pinhole(8, 4), 99).unwrap_err();
     assert!(error.to_string().contains("mask of dive/one.png: the mask is 4x4"), "{error}");
-    // Refused by its header: nothing of 4000x2000 pixels is allocated for a photograph of 8x4.
+    // Refused by its header, so no 4000x2000 pixels are allocated for a photograph of 8x4.
     let mut huge = file(rgb_test_picture(8, 4), ImageFormat::Png);
     huge[16..24].copy_from_slice(&[0, 0, 0x0F, 0xA0, 0, 0, 0x07, 0xD0]);
     let error = prepare_at(&picture, Some(&huge), &pinhole(8, 4), 99).unwrap_err();
@@ -170,9 +170,8 @@ fn a_smaller_mask_is_stretched_and_one_of_another_shape_refused() {
 
 #[test]
 fn undistortion_puts_every_point_where_the_pinhole_sees_it() {
-    // A photograph of smooth functions of the ray, taken through the lens; the pinhole picture of the same
-    // functions is known exactly. The inverse of the lens is found here by iteration, independently of the
-    // code.
+    // The photograph shows smooth functions of the ray through the lens; their pinhole picture is known
+    // exactly. The inverse of the lens is computed here by iteration, independently of the code.
     let (k, f, c) = (-0.15, 90.0, [41.0, 29.0]);
     let shade =
         |x: f64, y: f64| [0.5 + 0.4 * (4.0 * x).sin(), 0.5 + 0.4 * (5.0 * y).cos(), 0.5 + 0.3 * (x + y)];
@@ -213,7 +212,7 @@ fn undistortion_puts_every_point_where_the_pinhole_sees_it() {
 }
 
 #[test]
-fn what_the_photograph_does_not_show_is_masked() {
+fn pixels_outside_the_photograph_are_masked() {
     let picture = file(ImageBuffer::from_pixel(80, 60, Rgb([9_u8, 99, 199])), ImageFormat::Png);
     let camera =
         Camera { model: CameraModel::SimpleRadial, params: vec![60.0, 40.0, 30.0, 0.1], ..pinhole(80, 60) };
@@ -234,13 +233,13 @@ fn a_truncated_jpeg_is_refused_by_name_and_byte() {
     }
     let message = prepare_at(&jpeg[..jpeg.len() - 1], None, &camera, 1600).unwrap_err().to_string();
     assert!(message.contains(&format!("byte {}", jpeg.len() - 1)), "{message}");
-    // What cameras append behind the picture does no harm.
+    // Data that cameras append after the picture is ignored.
     let appended = [jpeg.as_slice(), &[0; 100]].concat();
     assert!(prepare_at(&appended, None, &camera, 1600).is_ok());
 }
 
 #[test]
-fn torn_and_foreign_files_are_refused_by_name() {
+fn damaged_and_unknown_files_are_refused_by_name() {
     let camera = pinhole(64, 48);
     for format in [ImageFormat::Png, ImageFormat::Tiff] {
         let bytes = file(rgb_test_picture(64, 48), format);
@@ -258,7 +257,7 @@ fn torn_and_foreign_files_are_refused_by_name() {
 }
 
 #[test]
-fn a_picture_of_another_size_than_its_camera_is_refused_with_both_sizes() {
+fn a_picture_must_have_the_size_of_its_camera() {
     let bytes = file(rgb_test_picture(64, 48), ImageFormat::Png);
     let message = prepare_at(&bytes, None, &pinhole(640, 480), 1600).unwrap_err().to_string();
     assert!(message.contains("64x48") && message.contains("640x480"), "{message}");
@@ -267,7 +266,7 @@ fn a_picture_of_another_size_than_its_camera_is_refused_with_both_sizes() {
 }
 
 #[test]
-fn headers_tell_sizes_without_pixels() {
+fn headers_give_sizes_without_pixels() {
     let folder = tempfile::tempdir().unwrap();
     for format in [ImageFormat::Png, ImageFormat::Jpeg, ImageFormat::Tiff] {
         let path = folder.path().join("picture");
@@ -294,31 +293,31 @@ fn png_header(width: u32, height: u32) -> Vec<u8> {
 }
 
 #[test]
-fn a_picture_that_announces_more_pixels_than_are_read_is_refused_by_its_header() {
-    // 13 GB of pixels for a decoder that believes it, in some hundred bytes.
+fn a_picture_over_the_pixel_limit_is_refused_by_its_header() {
+    // About a hundred bytes that declare 13 GB of pixels.
     let bomb = png_header(65_535, 65_535);
     let message = prepare_at(&bomb, None, &pinhole(65_535, 65_535), 1600).unwrap_err().to_string();
-    for part in ["dive/one.png", "65535x65535", "at most 268 million", "reduce it"] {
+    for part in ["dive/one.png", "65535x65535", "the limit is 268 million", "reduce it"] {
         assert!(message.contains(part), "{message}");
     }
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("bomb.png");
     std::fs::write(&path, &bomb).unwrap();
     assert!(
-        dimensions(&path).unwrap_err().to_string().contains("bomb.png: the picture says"),
+        dimensions(&path).unwrap_err().to_string().contains("bomb.png: the picture declares"),
         "at ingest too"
     );
-    // The largest size that is read is no fault of the header; its pixels are missing.
+    // The largest allowed size passes the header check; the pixels are missing.
     std::fs::write(&path, png_header(16_384, 16_384)).unwrap();
     assert_eq!(dimensions(&path).unwrap(), (16_384, 16_384));
     let mask = png_header(65_532, 65_532);
     let photograph = file(rgb_test_picture(16, 16), ImageFormat::Png);
     let message = prepare_at(&photograph, Some(&mask), &pinhole(16, 16), 1600).unwrap_err().to_string();
-    assert!(message.contains("mask of dive/one.png") && message.contains("at most 268 million"), "{message}");
+    assert!(message.contains("mask of dive/one.png") && message.contains("the limit is 268 million"), "{message}");
 }
 
 #[test]
-fn a_tiff_whose_entry_announces_more_values_than_its_file_holds_is_refused() {
+fn a_tiff_entry_with_more_values_than_the_file_is_refused() {
     let tiff = file(rgb_test_picture(8, 8), ImageFormat::Tiff);
     assert!(prepare_at(&tiff, None, &pinhole(8, 8), 99).is_ok());
     let start = u32::from_le_bytes(tiff[4..8].try_into().unwrap()) as usize;

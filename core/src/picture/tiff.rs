@@ -1,12 +1,12 @@
-//! The first directory of a TIFF (TIFF 6.0, section 2; BigTIFF): its size, and whether its counts can be
-//! true.
+//! The first directory of a TIFF (TIFF 6.0, section 2; BigTIFF): the size of the picture, and a check of the
+//! counts.
 //!
-//! A decoder makes room for as many values as an entry announces before it looks for them. A count is
-//! believed here only where the file could hold so many, so that a few bytes do not take hundreds of MB.
+//! A decoder allocates as many values as an entry declares before it reads them. A count that exceeds the
+//! file is refused here, so that a few bytes cannot make a decoder allocate hundreds of MB.
 
 use std::io::{Read, Seek, SeekFrom};
 
-/// Most entries of a directory: cameras write some dozens.
+/// Most entries of a directory; cameras write a few dozen.
 const MAX_ENTRIES: u64 = 4096;
 
 const IMAGE_WIDTH: u16 = 256;
@@ -30,7 +30,7 @@ impl<R: Read> Numbers<'_, R> {
     }
 }
 
-/// Columns and rows of the first picture; a sentence when they are not there or an entry announces more than
+/// Columns and rows of the first picture; a message if they are missing or an entry declares more values than
 /// the file could hold.
 pub(super) fn dimensions<R: Read + Seek>(file: &mut R) -> std::io::Result<Result<(u32, u32), String>> {
     let damaged =
@@ -51,9 +51,7 @@ pub(super) fn dimensions<R: Read + Seek>(file: &mut R) -> std::io::Result<Result
     numbers.file.seek(SeekFrom::Start(start))?;
     let entries = if is_big { numbers.next::<8>()? } else { numbers.next::<2>()? };
     if entries > MAX_ENTRIES {
-        return damaged(format!(
-            "its directory says that it has {entries} entries, and at most {MAX_ENTRIES} are read"
-        ));
+        return damaged(format!("its directory declares {entries} entries; the limit is {MAX_ENTRIES}"));
     }
     let (mut width, mut height) = (None, None);
     for _ in 0..entries {
@@ -67,10 +65,10 @@ pub(super) fn dimensions<R: Read + Seek>(file: &mut R) -> std::io::Result<Result
         };
         if count.checked_mul(value_bytes).is_none_or(|bytes| bytes > len) {
             return damaged(format!(
-                "entry {tag} of its directory says that it has {count} values of {value_bytes} bytes, and the file has {len}"
+                "entry {tag} of its directory declares {count} values of {value_bytes} bytes, but the file has {len} bytes"
             ));
         }
-        // A number stands at the start of the field, whose rest is of no meaning.
+        // A number is at the start of the field; the rest of the field is unused.
         let field = numbers.file.stream_position()?;
         let number = match kind {
             3 => numbers.next::<2>()?,
@@ -88,6 +86,6 @@ pub(super) fn dimensions<R: Read + Seek>(file: &mut R) -> std::io::Result<Result
     let side = |number: Option<u64>| number.and_then(|n| u32::try_from(n).ok()).filter(|&n| n > 0);
     match (side(width), side(height)) {
         (Some(width), Some(height)) => Ok(Ok((width, height))),
-        _ => damaged("its directory does not say how wide and high the picture is".to_owned()),
+        _ => damaged("its directory does not give the width and height of the picture".to_owned()),
     }
 }

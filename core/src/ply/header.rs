@@ -2,7 +2,7 @@
 
 use std::io::Read;
 
-/// How the body is written.
+/// Encoding of the body.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Format {
     Ascii,
@@ -23,7 +23,7 @@ pub(crate) enum Scalar {
     F64,
 }
 
-/// One property of an element that is not a list.
+/// One property of an element; lists are not kept.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Property {
     pub name: String,
@@ -36,7 +36,7 @@ pub(crate) struct Element {
     pub name: String,
     pub count: u64,
     pub properties: Vec<Property>,
-    /// Whether it has a property that is a list, so that its rows are of no fixed size.
+    /// Whether it has a list property, so that its rows have no fixed size.
     pub has_list: bool,
 }
 
@@ -51,7 +51,7 @@ pub(crate) struct Header {
 }
 
 impl Scalar {
-    /// By PLY's names and those that other programs use.
+    /// The type by PLY's name, or by the name that other programs use.
     fn from_name(name: &str) -> Option<Self> {
         Some(match name {
             "char" | "int8" => Self::I8,
@@ -105,7 +105,7 @@ impl Element {
 }
 
 impl Header {
-    /// Reads up to and including `end_header`; the message says what is wrong without naming the file.
+    /// Reads up to and including `end_header`; the error message does not name the file.
     pub fn read(file: &mut impl Read) -> Result<Self, String> {
         let mut lines = HeaderLines { file, line: Vec::new(), number: 0, bytes: 0 };
         if lines.next()? != "ply" {
@@ -144,7 +144,7 @@ impl Header {
                         elements.last_mut().ok_or_else(|| refuse("a property without an element"))?;
                     element.properties.push(Property { name: (*name).to_owned(), kind });
                 }
-                _ => return Err(refuse("not a line that PLY knows")),
+                _ => return Err(refuse("an unknown kind of line")),
             }
         }
         let bytes = lines.bytes;
@@ -165,7 +165,7 @@ impl Header {
     }
 }
 
-/// Lines byte by byte, so that nothing behind the header is consumed.
+/// Reads lines byte by byte, so that nothing after the header is consumed.
 struct HeaderLines<'a, R> {
     file: &'a mut R,
     line: Vec<u8>,
@@ -175,7 +175,7 @@ struct HeaderLines<'a, R> {
 
 impl<R: Read> HeaderLines<'_, R> {
     fn next(&mut self) -> Result<&str, String> {
-        // A binary file of another kind would be one endless line.
+        // A binary file of another kind could be one endless line.
         const MAX_LINE: usize = 4096;
         const MAX_LINES: usize = 10_000;
         self.line.clear();

@@ -1,9 +1,9 @@
-//! Gaussian models as PLY files, in the form that every splat program reads.
+//! Gaussian models as PLY files, in the layout that splat programs read.
 //!
-//! `binary_little_endian`, all `float`, in this order (the reference implementation's): `x y z nx ny nz
-//! f_dc_0..2 f_rest_0.. opacity scale_0..2 rot_0..3`, with `f_rest` channel by channel (all of R, then G,
-//! then B), opacity a logit, scales logarithms, rotation w x y z. Numbers are written exactly as they are
-//! trained, but quaternions are normalised.
+//! The format is `binary_little_endian`, all `float`, in the order of the reference implementation: `x y z nx
+//! ny nz f_dc_0..2 f_rest_0.. opacity scale_0..2 rot_0..3`. `f_rest` goes channel by channel (all of R, then
+//! G, then B). Opacity is a logit, scales are logarithms, rotation is w x y z. Values are written exactly as
+//! trained, except that quaternions are normalised.
 
 pub(crate) mod header;
 mod read;
@@ -13,14 +13,14 @@ mod write;
 use std::fmt::Write as _;
 
 pub use read::{SplatReader, SplatRow, from_bytes, is_antialiased, read_model, water_record};
-/// Comment of a model that was trained with the 2D filter of Mip-Splatting, so that it is rendered with it
-/// too.
+/// Header comment of a model that was trained with the 2D filter of Mip-Splatting and must be rendered with
+/// it.
 pub const ANTIALIASED: &str = "antialiased: opacity makes up for a low-pass of 0.3 px^2";
 
 pub use rows::replace_rows;
 pub use write::{SplatWriter, to_bytes, write_model, write_whole};
 
-/// The properties of a row, by the degree of the spherical harmonics.
+/// The properties of a row for a degree of the spherical harmonics.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Layout {
     sh_degree: u8,
@@ -37,7 +37,7 @@ impl Layout {
         self.sh_degree
     }
 
-    /// Coefficients of a channel above the constant one.
+    /// Coefficients of a channel without the constant one.
     pub fn rest_per_channel(self) -> usize {
         (usize::from(self.sh_degree) + 1).pow(2) - 1
     }

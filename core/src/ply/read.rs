@@ -1,9 +1,9 @@
-//! Reading splat PLY files of any program, row by row in bounded memory.
+//! Reads splat PLY files of any program, row by row in bounded memory.
 //!
-//! The header decides: the body may be binary of either byte order or text, properties may stand in any order
-//! and be of any number type, normals may be missing, the number of `f_rest` properties gives the degree,
-//! what Fathom does not know is skipped. Rows come out in the order that [`super::SplatWriter`] writes, so a
-//! merge copies them as they are.
+//! The body may be text or binary of either byte order. Properties may have any order and any number type,
+//! normals may be missing, and unknown properties are skipped. The number of `f_rest` properties gives the
+//! degree. Rows are returned in the layout that [`super::SplatWriter`] writes, so a merge copies them
+//! unchanged.
 
 use std::fs::File;
 use std::io::{BufReader, Read};
@@ -15,7 +15,7 @@ use crate::gaussians::Gaussians;
 use crate::water::WaterRecord;
 use crate::{CoreError, Result};
 
-/// What makes a PLY of other Gaussian formats.
+/// The command that converts other Gaussian formats to PLY.
 const CONVERTER: &str = "npx @playcanvas/splat-transform";
 
 /// A splat file that is being read.
@@ -27,9 +27,9 @@ pub struct SplatReader<R: Read> {
     comments: Vec<String>,
     count: u64,
     next: u64,
-    /// Where the rows start in the file.
+    /// First byte of the rows in the file.
     body_start: u64,
-    /// One entry a property of the canonical row: where it stands in the file's row, or `None` for 0.
+    /// For each property of the canonical row, its place in the file's row, or `None` for 0.
     columns: Vec<Option<Column>>,
     /// Numbers in a row of the file.
     numbers: usize,
@@ -39,10 +39,10 @@ pub struct SplatReader<R: Read> {
     row: Vec<u8>,
 }
 
-/// Where a property stands in the file's row.
+/// The place of a property in the file's row.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Column {
-    /// Its place among the properties.
+    /// Its index among the properties.
     place: usize,
     /// Its first byte in a binary row.
     start: usize,
@@ -64,7 +64,7 @@ impl SplatReader<BufReader<File>> {
     /// Opens a file.
     ///
     /// # Errors
-    /// When it cannot be read, is no splat PLY, or is shorter than its header says.
+    /// When it cannot be read, is not a splat PLY, or is shorter than its header says.
     pub fn open(path: &Path) -> Result<Self> {
         let file = File::open(path).map_err(CoreError::io("read", path))?;
         let len = file.metadata().map_err(CoreError::io("read", path))?.len();
@@ -95,7 +95,7 @@ impl<R: Read> SplatReader<R> {
         let refuse = |message: String| CoreError::input(name, message);
         let header = Header::read(&mut source).map_err(|message| match other_format(name) {
             Some(format) => refuse(format!(
-                "is a .{format} file, and models are read from PLY; convert it first: `{CONVERTER} IN.{format} OUT.ply`"
+                "is a .{format} file, but models must be PLY; convert it first: `{CONVERTER} IN.{format} OUT.ply`"
             )),
             None => refuse(message),
         })?;
@@ -130,17 +130,17 @@ impl<R: Read> SplatReader<R> {
         })
     }
 
-    /// Where rows begin in a file that holds them as [`super::SplatWriter`] writes them; `None` of any other.
+    /// First byte of the rows in a file as [`super::SplatWriter`] writes it; `None` for any other file.
     pub(super) fn rows_as_written_at(&self) -> Option<usize> {
         self.canonical.then_some(self.body_start as usize)
     }
 
-    /// Number of Gaussians by the header.
+    /// Number of Gaussians in the header.
     pub fn count(&self) -> u64 {
         self.count
     }
 
-    /// Layout of the rows that come out; its degree is that of the file.
+    /// Layout of the returned rows; its degree is that of the file.
     pub fn layout(&self) -> Layout {
         self.layout
     }
@@ -150,7 +150,7 @@ impl<R: Read> SplatReader<R> {
         &self.comments
     }
 
-    /// The next Gaussian; `None` behind the last.
+    /// The next Gaussian; `None` after the last.
     ///
     /// # Errors
     /// When the file ends before the number of rows that its header says.
@@ -203,7 +203,7 @@ impl<R: Read> SplatReader<R> {
 
     /// Reads the next line of a text body into `row`.
     fn read_line(&mut self) -> Result<()> {
-        // Far more than any number takes; without an end, a file of another kind would be one endless line.
+        // Far more than any number needs. Without a limit, a file of another kind could be one endless line.
         const MAX_NUMBER: usize = 64;
         let (index, count) = (self.next, self.count);
         let refuse = |message: String| {
@@ -241,7 +241,7 @@ impl<R: Read> SplatReader<R> {
         Ok(())
     }
 
-    /// At most `max` of the next Gaussians; `None` behind the last.
+    /// At most `max` of the next Gaussians; `None` after the last.
     ///
     /// # Errors
     /// As [`SplatReader::next_row`].
@@ -259,7 +259,7 @@ impl<R: Read> SplatReader<R> {
 
     fn check_len(&self, len: u64) -> Result<()> {
         if self.format == Format::Ascii {
-            // Lines are of any length; each is checked when it is read.
+            // Lines have any length; each is checked when it is read.
             return Ok(());
         }
         let row_bytes = self.raw.len() as u64;
@@ -291,7 +291,7 @@ pub fn read_model(path: &Path) -> Result<Gaussians> {
     SplatReader::open(path).and_then(read_all)
 }
 
-/// Whether the header of a model says that it was trained with [`super::ANTIALIASED`].
+/// Whether the header of a model has the comment [`super::ANTIALIASED`].
 ///
 /// # Errors
 /// As [`SplatReader::open`].
@@ -299,10 +299,10 @@ pub fn is_antialiased(path: &Path) -> Result<bool> {
     Ok(SplatReader::open(path)?.comments().iter().any(|comment| comment == super::ANTIALIASED))
 }
 
-/// The water that the header of a model carries; `None` for a model without a medium.
+/// The water record in the header of a model; `None` for a model without a medium.
 ///
 /// # Errors
-/// As [`SplatReader::open`]; also where the water cannot be read.
+/// As [`SplatReader::open`], and when the water record cannot be read.
 pub fn water_record(path: &Path) -> Result<Option<WaterRecord>> {
     WaterRecord::among(SplatReader::open(path)?.comments())
 }
@@ -338,7 +338,7 @@ fn push_gaussian(gaussians: &mut Gaussians, layout: Layout, row: &[u8]) {
     gaussians.quats.push([at(tail + 4), at(tail + 5), at(tail + 6), at(tail + 7)]);
 }
 
-/// The format of Gaussians other than PLY that a file's ending says.
+/// The other Gaussian format that a file's extension names.
 fn other_format(name: &str) -> Option<&'static str> {
     let (_, ending) = name.rsplit_once('.')?;
     ["splat", "ksplat", "spz", "sog"].into_iter().find(|format| ending.eq_ignore_ascii_case(format))
@@ -348,9 +348,7 @@ fn other_format(name: &str) -> Option<&'static str> {
 fn layout_of(vertex: &Element) -> Result<Layout, String> {
     let rest = vertex.properties.iter().filter(|property| property.name.starts_with("f_rest_")).count();
     (0..=3).filter_map(Layout::new).find(|layout| layout.rest_per_channel() * 3 == rest).ok_or_else(|| {
-        format!(
-            "{rest} f_rest properties are of no SH degree that Fathom reads (0, 9, 24 or 45: degree 0, 1, 2 or 3)"
-        )
+        format!("{rest} f_rest properties fit no SH degree (0, 9, 24 or 45: degree 0, 1, 2 or 3)")
     })
 }
 
@@ -373,7 +371,7 @@ fn columns_of(vertex: &Element, layout: Layout) -> Result<Vec<Option<Column>>, S
                 })),
                 None if matches!(name.as_str(), "nx" | "ny" | "nz") => Ok(None),
                 None => Err(format!(
-                    "the vertices have no property \"{name}\": this is no Gaussian splat model, or a damaged one"
+                    "the vertices have no property \"{name}\": this is not a Gaussian splat model, or a damaged one"
                 )),
             }
         })

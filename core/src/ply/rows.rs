@@ -1,27 +1,27 @@
-//! Other Gaussians in the place of some rows of a model, which stays byte for byte what it was otherwise.
+//! Replaces rows of a model; all other bytes stay as they are.
 
 use super::read::SplatReader;
 use super::write::push_row;
 use crate::gaussians::Gaussians;
 use crate::{CoreError, Result};
 
-/// Puts Gaussian `k` of `with` in the place of row `rows[k]` of `model`, the bytes of a PLY as
+/// Replaces row `rows[k]` of `model` by Gaussian `k` of `with`. `model` holds the bytes of a PLY as
 /// [`super::SplatWriter`] writes them; `name` is for messages. Quaternions are normalised.
 ///
 /// # Errors
-/// When `model` is no such PLY, a row is not in it, or `with` has another degree or number; `model` is then
-/// as it was.
+/// When `model` is not such a PLY or lacks a row, or when `with` has another degree or another number of
+/// Gaussians than rows; `model` is then unchanged.
 pub fn replace_rows(model: &mut [u8], name: &str, rows: &[usize], with: &Gaussians) -> Result<()> {
     let refuse = |message: String| Err(CoreError::input(name, message));
     let reader = SplatReader::from_bytes(model, name)?;
     let (layout, count) = (reader.layout(), reader.count());
     let Some(start) = reader.rows_as_written_at() else {
-        return refuse("its rows are not in the order in which this program writes them".into());
+        return refuse("its rows do not have the layout that this program writes".into());
     };
     if layout.sh_degree() != with.sh_degree || rows.len() != with.len() {
         let (degree, rows, gaussians) = (layout.sh_degree(), rows.len(), with.len());
         return refuse(format!(
-            "{gaussians} Gaussians of SH degree {} cannot take the place of {rows} rows of degree {degree}",
+            "{gaussians} Gaussians of SH degree {} cannot replace {rows} rows of degree {degree}",
             with.sh_degree
         ));
     }
@@ -57,7 +57,7 @@ mod tests {
 
     #[test]
     fn the_named_rows_change_and_no_other_byte() {
-        let comments = ["what else is said".to_owned()];
+        let comments = ["another comment".to_owned()];
         let before = to_bytes(&model(5, 1.0), &comments).unwrap();
         let mut after = before.clone();
         replace_rows(&mut after, "model", &[1, 4], &model(2, 50.0)).unwrap();
@@ -71,21 +71,21 @@ mod tests {
 
         replace_rows(&mut after, "model", &[1, 4], &was.split_where(|index| [1, 4].contains(&index)).0)
             .unwrap();
-        assert_eq!(after, before, "what was there is there again");
+        assert_eq!(after, before, "the first rows are back");
     }
 
     #[test]
-    fn what_does_not_fit_is_refused_and_changes_nothing() {
+    fn unsuitable_rows_are_refused_and_change_nothing() {
         let before = to_bytes(&model(3, 1.0), &[]).unwrap();
         let mut bytes = before.clone();
         let other = Gaussians { sh_degree: 0, sh_coeffs: vec![[0.0; 3]], ..model(1, 9.0) };
-        for (rows, with, said) in [
+        for (rows, with, fault) in [
             (&[0_usize, 3][..], &model(2, 9.0), "no row 3"),
             (&[0], &model(2, 9.0), "2 Gaussians"),
             (&[0], &other, "degree 0"),
         ] {
             let error = replace_rows(&mut bytes, "model", rows, with).unwrap_err().to_string();
-            assert!(error.contains(said), "{error}");
+            assert!(error.contains(fault), "{error}");
         }
         assert_eq!(bytes, before);
     }

@@ -7,7 +7,7 @@ fn sample(count: usize, sh_degree: u8) -> Gaussians {
     for n in 0..count {
         let value = |slot: u32| uniform_at(3, Stream::Test, n as u32, slot) * 4.0 - 2.0;
         gaussians.means.push([value(0), value(1), value(2)]);
-        // Unit to the last bit in f32, so that normalising changes nothing.
+        // Exactly unit in f32, so that normalising changes nothing.
         gaussians.quats.push([[1.0, 0.0, 0.0, 0.0], [0.6, 0.0, 0.8, 0.0], [0.5, -0.5, 0.5, -0.5]][n % 3]);
         gaussians.log_scales.push([value(3), value(4), value(5)]);
         gaussians.opacity_logits.push(value(6));
@@ -18,7 +18,7 @@ fn sample(count: usize, sh_degree: u8) -> Gaussians {
     gaussians
 }
 
-/// A file with a header of one's own and a body of floats.
+/// A file with the given header and a body of floats.
 fn file(header: &str, body: &[f32]) -> Vec<u8> {
     let mut bytes = header.as_bytes().to_vec();
     body.iter().for_each(|value| bytes.extend_from_slice(&value.to_le_bytes()));
@@ -41,7 +41,7 @@ fn models_of_every_degree_survive_to_the_last_bit() {
 }
 
 #[test]
-fn the_header_and_the_row_are_in_the_order_of_the_reference_implementation() {
+fn header_and_rows_have_the_order_of_the_reference() {
     let mut model = sample(1, 1);
     model.means = vec![[1.0, 2.0, 3.0]];
     model.sh_coeffs = vec![[10.0, 20.0, 30.0], [11.0, 21.0, 31.0], [12.0, 22.0, 32.0], [13.0, 23.0, 33.0]];
@@ -86,7 +86,7 @@ fn any_order_missing_normals_and_unknown_properties_are_read() {
     assert_eq!(model.sh_coeffs[1], [29.0, 28.0, 27.0]);
     let mut reader = SplatReader::from_bytes(&bytes, "m").unwrap();
     assert_eq!(reader.comments(), ["by another program"]);
-    // Rows come out in the order of the writer, ready to be copied.
+    // Rows are returned in the layout of the writer, ready to be copied.
     let row = reader.next_row().unwrap().unwrap();
     assert_eq!((row.index, row.position, row.bytes.len()), (0, [7.0, 6.0, 5.0], 17 * 4));
     let mut writer = SplatWriter::new(Vec::new(), "copy", 2, 0, &[]).unwrap();
@@ -118,7 +118,7 @@ fn a_truncated_model_is_refused_by_name_and_place() {
     let refused = message(&bytes[..bytes.len() - 1]);
     assert!(refused.contains("odd.ply"), "{refused}");
     assert!(refused.contains("inside Gaussian 2"), "{refused}");
-    // A stream has no length to check first: the row at fault is named with its offset.
+    // The length of a stream cannot be checked first: the message names the incomplete row and its offset.
     let mut reader = SplatReader::new(&bytes[..bytes.len() - 69], "stream").unwrap();
     reader.next_row().unwrap();
     let refused = reader.next_row().unwrap_err().to_string();
@@ -164,7 +164,7 @@ fn files_that_are_no_splat_models_are_refused_with_the_reason() {
     }
 }
 
-/// The model of `bytes`, a canonical file, with its body in another format: each row as `write` writes it.
+/// The model of the canonical file `bytes`, with its body in another format: `write` writes each row.
 fn reformatted(bytes: &[u8], format: &str, write: impl Fn(&[f32], &mut Vec<u8>)) -> Vec<u8> {
     let mut reader = SplatReader::from_bytes(bytes, "m").unwrap();
     let text = String::from_utf8_lossy(bytes);
@@ -187,20 +187,21 @@ fn text_and_the_other_byte_order_give_the_same_model() {
             row.iter().for_each(|value| out.extend_from_slice(&value.to_be_bytes()));
         });
         assert_eq!(from_bytes(&big, "m").unwrap(), model, "big-endian, degree {sh_degree}");
-        // Rust writes the shortest text that gives the same bits; Windows ends lines with two bytes.
+        // Rust writes the shortest text that gives the same bits. The lines end as on Windows, with two
+        // bytes.
         let text = reformatted(&bytes, "ascii", |row, out| {
             let words: Vec<String> = row.iter().map(f32::to_string).collect();
             out.extend_from_slice(format!("{}\r\n", words.join(" ")).as_bytes());
         });
         assert_eq!(from_bytes(&text, "m").unwrap(), model, "text, degree {sh_degree}");
-        // The last line may have no end.
+        // The last line may lack its line end.
         assert_eq!(from_bytes(&text[..text.len() - 2], "m").unwrap(), model);
         assert!(message(&big[..big.len() - 1]).contains("inside Gaussian 4"));
     }
 }
 
 #[test]
-fn lines_that_are_no_gaussian_are_refused_by_number() {
+fn invalid_rows_are_refused_by_number() {
     let bytes = to_bytes(&sample(2, 0), &[]).unwrap();
     let text = reformatted(&bytes, "ascii", |row, out| {
         out.extend_from_slice("1 ".repeat(row.len()).as_bytes());
@@ -222,14 +223,14 @@ fn lines_that_are_no_gaussian_are_refused_by_number() {
 }
 
 #[test]
-fn other_formats_of_gaussians_are_named_with_what_converts_them() {
+fn other_formats_are_named_with_a_converter() {
     for name in ["a.splat", "b.SPZ", "dir.x/c.ksplat", "d.sog"] {
         let refused = from_bytes(&[0x1F, 0x8B, 8, 0], name).unwrap_err().to_string();
         let format = name.rsplit('.').next().unwrap().to_lowercase();
         assert!(refused.contains(&format!("is a .{format} file")), "{refused}");
         assert!(refused.contains(&format!("IN.{format} OUT.ply")), "{refused}");
     }
-    // A PLY under another name is a PLY.
+    // A PLY with another extension is still a PLY.
     let bytes = to_bytes(&sample(1, 0), &[]).unwrap();
     assert!(from_bytes(&bytes, "model.splat").is_ok());
 }
@@ -271,7 +272,7 @@ fn quaternions_that_cannot_be_normalised_stay() {
 }
 
 #[test]
-fn a_model_says_whether_it_is_rendered_with_the_filter_of_mip_splatting() {
+fn a_header_says_whether_the_mip_splatting_filter_is_used() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("model.ply");
     for (comments, filtered) in

@@ -1,4 +1,4 @@
-//! Writing splat PLY files in the order that every program reads (that of the reference implementation).
+//! Writes splat PLY files in the property order of the reference implementation, which every program reads.
 
 use std::fs::File;
 use std::io::{BufWriter, Write};
@@ -8,7 +8,7 @@ use super::Layout;
 use crate::gaussians::Gaussians;
 use crate::{CoreError, Result};
 
-/// Writes rows one after the other; the number of rows is announced first and checked at the end.
+/// Writes rows one after the other. The number of rows is set at the start and checked at the end.
 pub struct SplatWriter<W: Write> {
     sink: W,
     name: String,
@@ -22,7 +22,7 @@ impl<W: Write> SplatWriter<W> {
     /// Writes the header. `name` is for messages; each comment is one line.
     ///
     /// # Errors
-    /// When the sink fails, or the degree or a comment cannot be written.
+    /// When the sink fails, the degree is above 3, or a comment has more than one line.
     pub fn new(mut sink: W, name: &str, count: u64, sh_degree: u8, comments: &[String]) -> Result<Self> {
         let layout = Layout::new(sh_degree).ok_or_else(|| {
             CoreError::input(name, format!("SH degree {sh_degree} cannot be written; 0 to 3 can"))
@@ -43,10 +43,10 @@ impl<W: Write> SplatWriter<W> {
         })
     }
 
-    /// Appends Gaussians, which must have the degree of the file. Quaternions are normalised.
+    /// Appends Gaussians of the file's degree. Quaternions are normalised.
     ///
     /// # Errors
-    /// When the sink fails or the degree is another.
+    /// When the sink fails or the degree differs.
     pub fn write(&mut self, gaussians: &Gaussians) -> Result<()> {
         if gaussians.sh_degree != self.layout.sh_degree() {
             return Err(CoreError::input(
@@ -67,7 +67,7 @@ impl<W: Write> SplatWriter<W> {
         Ok(())
     }
 
-    /// Appends a row as it stands: [`Layout::row_bytes`] bytes, as [`super::SplatReader::next_row`] gives
+    /// Appends a row unchanged: [`Layout::row_bytes`] bytes, as [`super::SplatReader::next_row`] returns
     /// them.
     ///
     /// # Errors
@@ -84,10 +84,10 @@ impl<W: Write> SplatWriter<W> {
         Ok(())
     }
 
-    /// Gives the sink back.
+    /// Flushes and returns the sink.
     ///
     /// # Errors
-    /// When another number of rows was written than was announced, or flushing fails.
+    /// When the number of rows differs from the one in the header, or flushing fails.
     pub fn finish(mut self) -> Result<W> {
         if self.written != self.announced {
             return Err(CoreError::input(
@@ -107,7 +107,7 @@ pub(super) fn push_row(row: &mut Vec<u8>, gaussians: &Gaussians, index: usize) {
     let mut put =
         |values: &[f32]| values.iter().for_each(|value| row.extend_from_slice(&value.to_le_bytes()));
     put(&gaussians.means[index]);
-    // Normals mean nothing here, but old readers go by position.
+    // Normals are unused, but old readers rely on the positions of the other properties.
     put(&[0.0; 3]);
     put(&sh[0]);
     // All of R, then all of G, then all of B.
@@ -121,7 +121,8 @@ pub(super) fn push_row(row: &mut Vec<u8>, gaussians: &Gaussians, index: usize) {
     put(&normalised(gaussians.quats[index]));
 }
 
-/// The unit quaternion, in f64 so that the result is the nearest f32; one that is zero or not finite stays.
+/// The unit quaternion, computed in f64 so that the result is the nearest f32. A zero or non-finite
+/// quaternion stays unchanged.
 fn normalised(quat: [f32; 4]) -> [f32; 4] {
     let norm = quat.iter().map(|value| f64::from(*value).powi(2)).sum::<f64>().sqrt();
     let usable = norm > 0.0 && norm.is_finite();
@@ -139,7 +140,7 @@ pub fn to_bytes(gaussians: &Gaussians, comments: &[String]) -> Result<Vec<u8>> {
     writer.finish()
 }
 
-/// Writes a model to a file, which appears whole or not at all.
+/// Writes a model to a file atomically.
 ///
 /// # Errors
 /// When the file cannot be written.
@@ -153,20 +154,20 @@ pub fn write_model(path: &Path, gaussians: &Gaussians, comments: &[String]) -> R
     })
 }
 
-/// Writes a file under a temporary name, syncs it, and renames it: a crash leaves the old file or the new
-/// one.
+/// Writes a file under a temporary name, syncs it and renames it, so that a crash leaves either the old file
+/// or the new one.
 ///
 /// # Errors
-/// What `write` returns, or when the file cannot be created, synced or renamed; the temporary file is removed
-/// then.
+/// The error of `write`, or when the file cannot be created, synced or renamed. The temporary file is then
+/// removed.
 pub fn write_whole(path: &Path, write: impl FnOnce(&mut dyn Write) -> Result<()>) -> Result<()> {
     let mut temporary = path.as_os_str().to_owned();
-    // The process in the name keeps two writers apart.
+    // The process id in the name keeps two writers apart.
     temporary.push(format!(".{}.tmp", std::process::id()));
     let temporary = Path::new(&temporary);
     let result = write_and_rename(path, temporary, write);
     if result.is_err() {
-        // Nothing more can be done when this fails too; the first error is the one to tell.
+        // If this fails too, nothing more can be done; the first error is the one to report.
         let _ = std::fs::remove_file(temporary);
     }
     result

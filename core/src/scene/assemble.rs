@@ -1,7 +1,7 @@
-//! From what a reader found to a [`Scene`]: the checks that all inputs share.
+//! Turns the draft of a reader into a [`Scene`], with the checks that all inputs share.
 //!
-//! Rules: a view whose photograph is missing is left out and named in a warning (kept, without its file, for
-//! `inspect`); everything that contradicts itself is an error. Views come out sorted by name.
+//! A view whose photograph is missing is left out and named in a warning; for `inspect` it is kept without
+//! the file. Contradictions are errors. Views are sorted by name.
 
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
@@ -13,7 +13,7 @@ use super::{Camera, Points, Pose, Purpose, Scene, View};
 use crate::config::DataConfig;
 use crate::{CoreError, Result, picture};
 
-/// What a reader found, unchecked.
+/// The unchecked result of a reader.
 pub(super) struct Draft {
     pub source: &'static str,
     pub root: PathBuf,
@@ -21,7 +21,7 @@ pub(super) struct Draft {
     pub cameras_file: PathBuf,
     pub views_file: PathBuf,
     pub points_file: PathBuf,
-    /// Where photographs may lie; the first that exists is taken.
+    /// Candidate folders of the photographs; see [`image_folder`].
     pub image_folders: Vec<PathBuf>,
     pub cameras: Vec<Camera>,
     pub views: Vec<DraftView>,
@@ -112,7 +112,7 @@ fn find_photographs(draft: &mut Draft, purpose: Purpose) -> Result<Vec<View>> {
         .par_iter()
         .map(|view| folder.map(|folder| folder.join(&view.file)).filter(|path| path.is_file()))
         .collect();
-    // Names may differ in case only, when a model comes from another system.
+    // Names may differ in case if a model comes from another system.
     if let Some(folder) = folder.filter(|_| files.contains(&None)) {
         let index = FileIndex::of(folder)?;
         for (file, view) in files.iter_mut().zip(&listed).filter(|(file, _)| file.is_none()) {
@@ -162,9 +162,9 @@ fn find_photographs(draft: &mut Draft, purpose: Purpose) -> Result<Vec<View>> {
     Ok(views)
 }
 
-/// The first folder that holds one of the photographs, else the first `images/`.
+/// The first folder that holds one of the photographs, otherwise the first `images/`.
 fn image_folder<'a>(folders: &'a [PathBuf], views: &[DraftView]) -> Option<&'a PathBuf> {
-    // A few views decide: asking for all of thousands in every folder would be slow on network disks.
+    // A few views decide: checking thousands in every folder would be slow on network disks.
     let probe = || views.iter().step_by((views.len() / 8).max(1));
     folders
         .iter()
@@ -230,7 +230,7 @@ fn find_masks(draft: &mut Draft, views: &mut [View]) -> Result<()> {
         ));
     } else if !without.is_empty() {
         draft.warnings.push(format!(
-            "{}: {} of {} images have no mask and count whole: {}",
+            "{}: {} of {} images have no mask, so all their pixels count: {}",
             folder.display(),
             without.len(),
             views.len(),
@@ -240,21 +240,23 @@ fn find_masks(draft: &mut Draft, views: &mut [View]) -> Result<()> {
     Ok(())
 }
 
-/// Training holds positions in f32: far from the origin its steps become visible.
+/// Warns of coordinates far from the origin: training stores positions in f32, whose steps become visible
+/// there.
 fn warn_of_far_origin(scene: &mut Scene) {
-    // f32 resolves 6e-8 of a coordinate: at this ratio 6e-4 of the extent, a pixel of a picture of 1600.
+    // f32 resolves 6e-8 of a coordinate. At this ratio that is 6e-4 of the extent, one pixel in a picture
+    // of 1600.
     const MAX_RATIO: f64 = 1e4;
     let extent = scene.extent();
     let farthest = scene.views.iter().map(|view| view.pose.centre().length()).fold(0.0, f64::max);
     if extent > 0.0 && farthest > MAX_RATIO * extent {
         scene.warnings.push(format!(
-            "the cameras lie {farthest:.0} units far from the origin but only {extent:.3} units from their middle, \
+            "the cameras are {farthest:.0} units far from the origin but only {extent:.3} units from their middle, \
              which 32-bit positions cannot resolve; shift the model to a local origin (`colmap model_transformer`)"
         ));
     }
 }
 
-/// What training needs and `inspect` does not.
+/// Checks what only training needs.
 fn check_trainable(scene: &Scene, points_file: &Path, options: &DataConfig) -> Result<()> {
     let views = scene.views.len();
     let held_out = if options.test_every == 0 { 0 } else { views.div_ceil(options.test_every as usize) };
@@ -275,7 +277,7 @@ fn check_trainable(scene: &Scene, points_file: &Path, options: &DataConfig) -> R
              poses, or export the points with the cameras",
         ));
     }
-    // A camera model that cannot be undistorted is refused here, not after the upload.
+    // Camera models that cannot be undistorted are refused here, not after the upload.
     for camera in &scene.cameras {
         if scene.views.iter().any(|view| view.camera_id == camera.id) {
             camera.pinhole()?;
@@ -284,7 +286,7 @@ fn check_trainable(scene: &Scene, points_file: &Path, options: &DataConfig) -> R
     Ok(())
 }
 
-/// The first few names, and how many more there are.
+/// The first few names and the number of the others.
 fn some_of(names: &[String]) -> String {
     const SHOWN: usize = 3;
     let mut text = names.iter().take(SHOWN).map(|name| format!("\"{name}\"")).collect::<Vec<_>>().join(", ");

@@ -1,7 +1,7 @@
-//! Little-endian reading of a file that may lie about itself.
+//! Little-endian reading of untrusted files.
 //!
-//! Every read knows its offset and what is being read, so that a torn file is reported by place. A count is
-//! believed only after the bytes left in the file could hold that many entries: nothing absurd is allocated.
+//! Every read has its offset and a description, so that errors name the place in the file. A count is
+//! accepted only if the rest of the file can hold that many entries, so nothing absurd is allocated.
 
 use std::fs::File;
 use std::io::{BufRead, BufReader, Read};
@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 
 use crate::{CoreError, Result};
 
-/// A file read front to back.
+/// A file that is read from front to back.
 pub(super) struct ByteReader {
     file: BufReader<File>,
     path: PathBuf,
@@ -58,7 +58,7 @@ impl ByteReader {
 
     /// A string that ends with a zero byte.
     pub fn c_string(&mut self, what: &dyn Fn() -> String) -> Result<String> {
-        // No file system has longer paths; without a bound a torn file would be read to its end.
+        // No file system has longer paths. Without a limit, a damaged file would be read to its end.
         const LIMIT: u64 = 4096;
         let start = self.offset;
         let mut name = Vec::new();
@@ -80,7 +80,7 @@ impl ByteReader {
         String::from_utf8(name).map_err(|_| self.fault(start, &format!("{} is not valid UTF-8", what())))
     }
 
-    /// A count of entries of at least `entry_bytes` each, checked against the rest of the file.
+    /// A count of entries of at least `entry_bytes` each, checked against the size of the rest of the file.
     pub fn count(&mut self, entry_bytes: u64, entries: &str, what: &dyn Fn() -> String) -> Result<usize> {
         let start = self.offset;
         let count = self.u64(what)?;
@@ -89,7 +89,7 @@ impl ByteReader {
             return Err(self.fault(
                 start,
                 &format!(
-                    "{} says {count} {entries}, at least {entry_bytes} bytes each, but only {} bytes follow; \
+                    "{}: {count} {entries} of at least {entry_bytes} bytes each are declared, but only {} bytes follow; \
                      the file is truncated or damaged: copy it again or export the model anew",
                     what(),
                     self.left()
@@ -106,7 +106,7 @@ impl ByteReader {
         Ok(())
     }
 
-    /// Refuses bytes behind the last entry: then the count at the start of the file was wrong.
+    /// Refuses bytes after the last entry: they show that the count at the start of the file is wrong.
     pub fn finish(&self, count: usize, entries: &str) -> Result<()> {
         if self.left() == 0 {
             return Ok(());
@@ -114,7 +114,7 @@ impl ByteReader {
         Err(self.fault(
             self.offset,
             &format!(
-                "{} bytes follow after the {count} {entries} that the file announces; \
+                "{} bytes follow after the {count} {entries} that the file declares; \
                  its count is wrong: export the model anew",
                 self.left()
             ),

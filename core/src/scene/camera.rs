@@ -66,7 +66,7 @@ impl CameraModel {
         Self::ALL[self as usize].1
     }
 
-    /// Number of parameters in COLMAP's files; a wrong one would lose the place in `cameras.bin`.
+    /// Number of parameters in COLMAP's files; `cameras.bin` cannot be read with a wrong one.
     pub fn param_count(self) -> usize {
         Self::ALL[self as usize].2
     }
@@ -87,24 +87,22 @@ impl CameraModel {
     }
 }
 
-/// Farthest that a camera or a point may lie from the origin along an axis, scene units. Squares of such
-/// numbers are still f32, which training takes; the way to the moon has 4e11 millimetres.
+/// Largest distance of a camera or a point from the origin along an axis, scene units. Squares of such
+/// numbers still fit f32, which training uses. The distance to the moon is 4e11 millimetres.
 pub(super) const MAX_COORDINATE: f64 = 1e12;
 
-/// Largest parameter of a camera. Lenses are far below it, and no power that distortion takes of it overflows
-/// an f64.
+/// Largest parameter of a camera. Lenses are far below it, and its powers in the distortion formula fit f64.
 const MAX_PARAMETER: f64 = 1e9;
 
-/// Smallest focal length, pixels. A thousandth of a pixel is no lens, and what is divided by it must stay
-/// finite.
+/// Smallest focal length, pixels. No lens comes near it, and quotients by it stay finite.
 const MIN_FOCAL: f64 = 1e-3;
 
-/// Whether a place is one that can be worked with: finite, and within [`MAX_COORDINATE`] on every axis.
+/// Whether a position is usable: finite, and within [`MAX_COORDINATE`] on every axis.
 pub(super) fn is_near(place: DVec3) -> bool {
     place.abs().max_element() <= MAX_COORDINATE && !place.is_nan()
 }
 
-/// A camera as the input gives it.
+/// A camera as in the input.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Camera {
     /// The input's number.
@@ -117,16 +115,16 @@ pub struct Camera {
     pub height: u32,
     /// Parameters in COLMAP's order for the model; pixels and distortion coefficients.
     ///
-    /// One addition: OPENCV may have ten instead of eight, the last two being the coefficients of r^6 and r^8
-    /// that nerfstudio calls k3 and k4 and no model of COLMAP holds.
+    /// One addition: OPENCV may have ten parameters instead of eight. The last two are the coefficients of
+    /// r^6 and r^8, k3 and k4 in nerfstudio, which no model of COLMAP has.
     pub params: Vec<f64>,
 }
 
 impl Camera {
-    /// Checks size, parameters and focal lengths; the message names the camera but no file.
+    /// Checks size, parameters and focal lengths; the message names the camera but not the file.
     pub(super) fn check(&self) -> Result<(), String> {
         let Self { id, model, width, height, params } = self;
-        // The largest side that JPEG can store; no camera in use comes near it.
+        // The largest side that JPEG can store; no camera comes near it.
         const MAX_SIDE: u32 = 65_535;
         if !(1..=MAX_SIDE).contains(width) || !(1..=MAX_SIDE).contains(height) {
             return Err(format!(
@@ -180,7 +178,7 @@ pub struct PinholeCamera {
 }
 
 impl PinholeCamera {
-    /// The unit direction in which the middle of pixel `index` looks (row-major), camera frame.
+    /// Unit direction through the middle of pixel `index` (row-major), camera frame.
     pub fn direction(&self, index: usize) -> DVec3 {
         let width = self.width as usize;
         let (x, y) = ((index % width) as f64 + 0.5, (index / width) as f64 + 0.5);
@@ -196,9 +194,9 @@ impl PinholeCamera {
         Self { width, height, fx: self.fx * sx, fy: self.fy * sy, cx: self.cx * sx, cy: self.cy * sy }
     }
 
-    /// A camera at the same place for pictures of another size and shape: all that this one sees is in them,
-    /// and more at the sides where the shapes differ. The scale is the same in x and y, so nothing is
-    /// distorted.
+    /// A camera at the same position for pictures of another size and aspect ratio. They show everything that
+    /// this one sees, and more at the sides if the aspect ratios differ. The scale is the same in x and y, so
+    /// nothing is distorted.
     pub fn reshaped(&self, width: u32, height: u32) -> Self {
         let (sx, sy) = (f64::from(width) / f64::from(self.width), f64::from(height) / f64::from(self.height));
         let scale = sx.min(sy);
@@ -216,7 +214,7 @@ impl PinholeCamera {
         }
     }
 
-    /// The size of this camera's picture when its longest side is at most `max_side`.
+    /// This camera resized so that its longest side is at most `max_side`.
     pub fn fitted(&self, max_side: u32) -> Self {
         let longest = self.width.max(self.height);
         if longest <= max_side {
@@ -244,14 +242,14 @@ impl Pose {
         Self { rotation: DQuat::from_xyzw(x, y, z, w).normalize(), translation: translation.into() }
     }
 
-    /// Whether the rotation has unit length to 1e-6 and the camera stands within 1e12 scene units of the
-    /// origin, so that no number that is made of it overflows.
+    /// Whether the rotation has unit length to 1e-6 and the camera is within 1e12 scene units of the origin
+    /// on every axis, so that nothing computed from it overflows.
     pub fn is_sound(&self) -> bool {
         is_near(self.translation) && is_near(self.centre()) && (self.rotation.length() - 1.0).abs() < 1e-6
     }
 
-    /// Pose of a camera at `eye` whose z axis points at `target`, with `down` as near to its y axis as can
-    /// be.
+    /// Pose of a camera at `eye` whose z axis points at `target` and whose y axis is as close to `down` as
+    /// possible.
     pub fn looking_at(eye: DVec3, target: DVec3, down: DVec3) -> Self {
         let z = (target - eye).normalize();
         let x = down.cross(z).normalize();
@@ -286,13 +284,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn another_shape_shows_all_that_the_camera_sees_undistorted() {
+    fn another_aspect_ratio_shows_all_that_the_camera_sees() {
         let camera = PinholeCamera { width: 100, height: 50, fx: 80.0, fy: 82.0, cx: 48.0, cy: 30.0 };
         for (width, height, scale) in [(200, 100, 2.0), (200, 400, 2.0), (300, 25, 0.5), (1000, 500, 10.0)] {
             let other = camera.reshaped(width, height);
             assert_eq!((other.width, other.height), (width, height));
             assert_eq!((other.fx, other.fy), (80.0 * scale, 82.0 * scale), "{width}x{height}");
-            // Where the corners of the old picture lie in the new one: inside, in its middle.
+            // The old picture must be centred inside the new one.
             let left = other.cx - camera.cx * scale;
             let top = other.cy - camera.cy * scale;
             assert!(left >= 0.0 && top >= 0.0, "{other:?}");

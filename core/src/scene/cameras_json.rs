@@ -1,7 +1,7 @@
 //! The `cameras.json` that 3DGS writes beside a model: poses and intrinsics, no points.
 //!
 //! `rotation` is camera to world, row by row, with COLMAP's axes; `position` is the camera's centre. 3DGS
-//! does not store the principal point, so it is the middle; ours does (`cx`, `cy`).
+//! does not store the principal point, so the middle is used. Files of Fathom store it (`cx`, `cy`).
 
 use std::path::Path;
 

@@ -1,4 +1,4 @@
-//! COLMAP models: where they lie in a folder, which of several is taken, and what they hold.
+//! Finds COLMAP models in a folder, chooses the largest one and reads it.
 
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
@@ -14,13 +14,13 @@ pub(super) struct RawImage {
     pub name: String,
     pub camera_id: u32,
     pub pose: Pose,
-    /// Byte or line where it stands.
+    /// Its byte or line in the file.
     pub place: String,
 }
 
-/// Points in the making.
+/// Points while they are read.
 pub(super) struct RawPoints<'a> {
-    /// Index of a view by name, by the id of its image.
+    /// Maps the id of an image to the index of its view by name.
     view_of_image: &'a HashMap<u32, u32>,
     pub points: Points,
     /// Points left out because a coordinate is not finite or beyond [`MAX_COORDINATE`].
@@ -35,7 +35,7 @@ impl<'a> RawPoints<'a> {
         Self { view_of_image, points: Points::default(), not_finite: 0, unknown: 0, track: Vec::new() }
     }
 
-    /// Notes that the point to be added next was seen by the image of this id.
+    /// Records that the image of this id sees the next point.
     pub fn see(&mut self, image_id: u32) {
         match self.view_of_image.get(&image_id) {
             Some(view) => self.track.push(*view),
@@ -51,7 +51,7 @@ impl<'a> RawPoints<'a> {
     }
 }
 
-/// The pose of an image, or what is wrong with it.
+/// The pose of an image, or a message about its fault.
 pub(super) fn image_pose(name: &str, quat_wxyz: [f64; 4], translation: [f64; 3]) -> Result<Pose, String> {
     let help = "remove the image from the model or run the reconstruction again";
     if !quat_wxyz.iter().chain(&translation).all(|value| value.is_finite()) {
@@ -66,13 +66,13 @@ pub(super) fn image_pose(name: &str, quat_wxyz: [f64; 4], translation: [f64; 3])
     let pose = Pose::from_wxyz(quat_wxyz, translation);
     if !pose.is_sound() {
         return Err(format!(
-            "image \"{name}\" stands more than {MAX_COORDINATE:e} scene units from the origin; {help}"
+            "image \"{name}\" is more than {MAX_COORDINATE:e} scene units from the origin; {help}"
         ));
     }
     Ok(pose)
 }
 
-/// The form of the files of a model. COLMAP itself prefers binary where both exist.
+/// The format of a model's files. COLMAP itself prefers binary if both exist.
 #[derive(Clone, Copy, PartialEq)]
 enum Form {
     Binary,
@@ -113,13 +113,13 @@ impl Model {
     }
 }
 
-/// The models of a folder: all of the first place that has any.
+/// The models of a folder: all in the first location that has any.
 pub(super) fn find_models(root: &Path) -> Result<Vec<Model>> {
     for place in [root.join("sparse"), root.join("colmap").join("sparse"), root.to_owned()] {
         let mut folders = super::files::sorted_entries(&place)?;
         folders.retain(|path| {
-            // Of the given folder only what COLMAP numbers, as when `sparse` itself is given: it may hold
-            // anything.
+            // In the given folder, which may hold anything, only numbered folders count, as when `sparse`
+            // itself is given.
             let numbered = path.file_name().is_some_and(|name| name.to_str().is_some_and(is_number));
             (place != root || numbered) && path.is_dir()
         });
@@ -139,7 +139,7 @@ fn is_number(name: &str) -> bool {
     !name.is_empty() && name.bytes().all(|byte| byte.is_ascii_digit())
 }
 
-/// Names the missing half where only one of the two files of a model exists.
+/// Names the missing file if only one of a model's two files exists.
 fn refuse_half_a_model(folder: &Path) -> Result<()> {
     for (there, missing) in [("cameras", "images"), ("images", "cameras")] {
         for form in ["bin", "txt"] {
@@ -187,7 +187,7 @@ pub(super) fn read(root: &Path, models: &[Model], purpose: Purpose) -> Result<Dr
         }
         Form::Text => (colmap_text::read_cameras(&cameras_file)?, colmap_text::read_images(&images_file)?),
     };
-    // Ids are in the order in which photographs came into a database.
+    // Ids follow the order in which photographs were added to a database.
     images.sort_by(|a, b| a.name.cmp(&b.name));
     let points_file = model.file("points3D");
     let view_of_image: HashMap<u32, u32> = images.iter().map(|image| image.id).zip(0..).collect();
@@ -244,12 +244,12 @@ pub(super) fn read(root: &Path, models: &[Model], purpose: Purpose) -> Result<Dr
     })
 }
 
-/// Where photographs may lie: `images/` in the folder that was given, beside the model and above it; then the
-/// given folder itself. Above the given folder only when that is no dataset but a part of one.
+/// Candidate folders of the photographs: `images/` in the given folder, beside the model and above it; then
+/// the given folder itself. Folders above the given one only count if it is a part of a dataset.
 fn image_folders(root: &Path, model: &Path) -> Vec<PathBuf> {
     let is_part = model == root || root.ends_with("sparse") || root.ends_with("colmap");
     let up_to_root = model.strip_prefix(root).map_or(0, |inner| inner.components().count());
-    // dataset/colmap/sparse/0 is the deepest usual place: three steps up.
+    // dataset/colmap/sparse/0 is the deepest usual location: three steps up.
     let levels = if is_part { 3 } else { up_to_root };
     let mut folders = vec![root.join("images")];
     let above = model.ancestors().take(levels + 1).map(|up| up.join("images"));

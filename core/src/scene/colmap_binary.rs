@@ -1,8 +1,8 @@
 //! COLMAP's `cameras.bin`, `images.bin` and `points3D.bin` (`scene/reconstruction_io_binary.cc`).
 //!
-//! All little-endian, a u64 count first. Rigs and frames (COLMAP 3.12 and later) are ignored: `images.bin`
-//! still carries each image's own pose. 2D points are skipped without being held in memory; of tracks the
-//! images are kept.
+//! All files are little-endian and start with a u64 count. Rigs and frames (COLMAP 3.12 and later) are
+//! ignored: `images.bin` still holds each image's own pose. 2D points are skipped without being held in
+//! memory; tracks keep only the images.
 
 use std::path::Path;
 
@@ -50,7 +50,7 @@ pub(super) fn read_cameras(path: &Path) -> Result<Vec<Camera>> {
     Ok(cameras)
 }
 
-/// The number of images that `images.bin` announces.
+/// The number of images in the header of `images.bin`.
 pub(super) fn image_count(path: &Path) -> Result<u64> {
     ByteReader::open(path)?.u64(&|| "the number of images".to_owned())
 }

@@ -1,7 +1,7 @@
 //! COLMAP's `cameras.txt`, `images.txt` and `points3D.txt`.
 //!
-//! Lines that start with `#` are comments. An image takes two lines; the second (its 2D points) may be empty
-//! but is always there. A name is the rest of its line and may hold spaces.
+//! Lines that start with `#` are comments. An image takes two lines; the second (its 2D points) is always
+//! present but may be empty. A name is the rest of its line and may hold spaces.
 
 use std::fs::File;
 use std::io::{BufRead, BufReader};
@@ -43,7 +43,7 @@ pub(super) fn read_cameras(path: &Path) -> Result<Vec<Camera>> {
     Ok(cameras)
 }
 
-/// The number of images: half of the lines behind the comments.
+/// The number of images: half of the lines that are not comments.
 pub(super) fn image_count(path: &Path) -> Result<u64> {
     let mut file = Lines::open(path)?;
     let mut count = 0;
@@ -59,7 +59,7 @@ pub(super) fn read_images(path: &Path) -> Result<Vec<RawImage>> {
     let mut images = Vec::new();
     while let Some(line) = file.next_entry()? {
         let fault = |message: String| file.fault(&message);
-        // Nine numbers, then the name as it stands, spaces included.
+        // Nine fields, then the name unchanged, spaces included.
         let mut rest = line.trim();
         let mut word = || {
             let (word, tail) = rest.split_once(|c: char| c.is_ascii_whitespace()).unwrap_or((rest, ""));
@@ -82,7 +82,7 @@ pub(super) fn read_images(path: &Path) -> Result<Vec<RawImage>> {
         let [qw, qx, qy, qz, tx, ty, tz] = pose;
         let pose = image_pose(&name, [qw, qx, qy, qz], [tx, ty, tz]).map_err(fault)?;
         images.push(RawImage { id, name, camera_id, pose, place: format!("line {}", file.number) });
-        // The line of 2D points: absent behind the last image in files that editors have trimmed.
+        // The line of 2D points, which is missing after the last image if an editor has trimmed the file.
         if let Some(points) = file.next_line()? {
             let words = points.split_ascii_whitespace().count();
             if words % 3 != 0 {
@@ -135,7 +135,7 @@ impl Lines {
         Ok(Self { file, path: path.to_owned(), buffer: String::new(), number: 0 })
     }
 
-    /// The next line, whatever it holds.
+    /// The next line, comments and empty lines included.
     fn next_line(&mut self) -> Result<Option<&str>> {
         self.buffer.clear();
         self.number += 1;
@@ -172,11 +172,11 @@ fn parse_integer<T: std::str::FromStr>(word: &str, what: &str) -> Result<T, Stri
     match word.parse() {
         Ok(value) => Ok(value),
         Err(_) if word.is_empty() => Err(format!("the line ends before {what}; the file is truncated")),
-        Err(_) => Err(format!("\"{word}\" stands where {what} should be")),
+        Err(_) => Err(format!("found \"{word}\" instead of {what}")),
     }
 }
 
-/// A float as any C library prints it, `-nan(ind)` of Windows included.
+/// A float as any C library prints it, including `-nan(ind)` of Windows.
 fn parse_float(word: &str) -> Result<f64, String> {
     let lower = word.to_ascii_lowercase();
     let unsigned = lower.trim_start_matches(['-', '+']);
@@ -186,7 +186,7 @@ fn parse_float(word: &str) -> Result<f64, String> {
     match word.parse() {
         Ok(value) => Ok(value),
         Err(_) if word.is_empty() => {
-            Err("the line ends where a number should follow; the file is truncated".to_owned())
+            Err("the line ends before a number; the file is truncated".to_owned())
         }
         Err(_) => Err(format!("\"{word}\" is not a number")),
     }

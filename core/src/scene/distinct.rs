@@ -1,22 +1,22 @@
-//! The cameras of an input that repeats their intrinsics in every frame: equal ones are one camera.
+//! Merges equal cameras of inputs that repeat the intrinsics in every frame.
 
 use std::collections::HashMap;
 
 use super::{Camera, CameraModel};
 
-/// Cameras by ascending id, from 1, in the order in which they came.
+/// Cameras by ascending id, from 1, in the order of their first use.
 #[derive(Default)]
 pub(super) struct DistinctCameras {
     cameras: Vec<Camera>,
-    /// By all that makes them differ; numbers by their bits. A search through the list would take as long as
-    /// the square of the frames where each has a camera of its own.
+    /// The id for each combination of model, size and parameters (as bits). A search through the list would
+    /// take quadratic time if each frame has its own camera.
     ids: HashMap<(CameraModel, u32, u32, Vec<u64>), u32>,
 }
 
 impl DistinctCameras {
-    /// The id of a camera, which is checked when it is new; its own id does not count.
+    /// The id of a camera. A new camera is checked; its own id is ignored.
     pub fn id_of(&mut self, camera: Camera) -> Result<u32, String> {
-        // -0 is 0 here.
+        // -0 and 0 are equal here.
         let bits = camera.params.iter().map(|value| (value + 0.0).to_bits()).collect();
         let key = (camera.model, camera.width, camera.height, bits);
         if let Some(id) = self.ids.get(&key) {
@@ -30,7 +30,7 @@ impl DistinctCameras {
         Ok(id)
     }
 
-    /// All of them.
+    /// All cameras.
     pub fn into_cameras(self) -> Vec<Camera> {
         self.cameras
     }
@@ -47,7 +47,7 @@ mod tests {
     }
 
     #[test]
-    fn equal_cameras_are_one_and_those_that_cannot_be_are_refused_each_time() {
+    fn equal_cameras_are_one_and_impossible_ones_are_refused() {
         let mut cameras = DistinctCameras::default();
         assert_eq!(
             [(5.0, 0.0), (6.0, 0.0), (5.0, -0.0)].map(|(f, cx)| cameras.id_of(camera(f, cx)).ok()),
@@ -60,11 +60,11 @@ mod tests {
     }
 
     #[test]
-    fn a_camera_for_each_of_very_many_frames_takes_no_time_by_their_square() {
+    fn one_camera_per_frame_does_not_take_quadratic_time() {
         let start = Instant::now();
         let mut cameras = DistinctCameras::default();
         assert!((1..=300_000).all(|frame| cameras.id_of(camera(f64::from(frame), 4.0)) == Ok(frame)));
-        // A search through a list makes 4.5e10 comparisons here, a minute and more; this takes a tenth of a
+        // A search through a list would make 4.5e10 comparisons, over a minute; this takes a tenth of a
         // second.
         assert!(start.elapsed() < Duration::from_secs(15), "{:?}", start.elapsed());
     }

@@ -1,4 +1,4 @@
-//! Finding photographs and masks on the disk.
+//! Finds photographs and masks on disk.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use crate::paths::check_inside;
 use crate::{CoreError, Result};
 
-/// The entries of a folder by ascending name; none where there is no folder.
+/// The entries of a folder by ascending name; none if the folder does not exist.
 pub(super) fn sorted_entries(folder: &Path) -> Result<Vec<PathBuf>> {
     let entries = match std::fs::read_dir(folder) {
         Ok(entries) => entries,
@@ -27,14 +27,14 @@ pub(super) fn sorted_entries(folder: &Path) -> Result<Vec<PathBuf>> {
 
 /// All files below a folder by their relative path in lower case, `/` between folders.
 ///
-/// Files whose names differ in case only: the first by name wins.
+/// If names differ in case only, the first by name wins.
 pub(super) struct FileIndex {
     files: BTreeMap<String, PathBuf>,
 }
 
 impl FileIndex {
     pub fn of(folder: &Path) -> Result<Self> {
-        // Deeper than any dataset; stops at links that lead in a circle.
+        // Deeper than any dataset; stops at circular links.
         const MAX_DEPTH: usize = 16;
         let mut files = BTreeMap::new();
         let mut open = vec![(folder.to_owned(), String::new(), 0)];
@@ -81,16 +81,16 @@ fn stem(name: &str) -> &str {
     }
 }
 
-/// Refuses names that cannot be a photograph's: they become parts of paths on other machines.
+/// Refuses unsafe names of photographs, because they become parts of paths on other machines.
 pub(super) fn check_name(name: &str) -> Result<(), String> {
     check_inside(name).map_err(|fault| {
-        // A name of megabytes is told by its beginning.
+        // Only the beginning of a long name is shown.
         let shown: String = name.chars().take(80).collect();
         format!("\"{}\" cannot be the name of a photograph: it {fault}", shown.escape_debug())
     })
 }
 
-/// Makes a name of a path as inputs write it: `/` between folders, without `.` and `..`.
+/// Converts a path of the input to a name: `/` between folders, without `.` and `..`.
 pub(super) fn name_of(path: &str) -> String {
     path.split(['/', '\\']).filter(|part| !matches!(*part, "" | "." | "..")).collect::<Vec<_>>().join("/")
 }
@@ -100,7 +100,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_name_that_leaves_its_folder_is_refused_and_a_long_one_is_told_by_its_beginning() {
+    fn unsafe_names_are_refused_and_long_ones_are_shortened() {
         assert_eq!(check_name("left cam/frame 12.JPG"), Ok(()));
         assert!(check_name("a/../../b.jpg").is_err_and(|fault| fault.contains("without \"..\"")));
         assert!(check_name(&"a".repeat(1 << 20)).is_err_and(|fault| fault.len() < 200));

@@ -1,11 +1,11 @@
-//! A scene as it travels: poses and cameras, with every file named by its digest.
+//! A scene for transfer: poses and cameras, with every file named by its digest.
 
 use serde::{Deserialize, Serialize};
 
 use super::{Camera, Pose};
 use crate::{CoreError, Result};
 
-/// A file by content: BLAKE3 in hex and its length.
+/// A file identified by its content: BLAKE3 in hex and its length.
 #[derive(Clone, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct BlobRef {
@@ -19,51 +19,51 @@ pub struct BlobRef {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ManifestView {
-    /// Name by the input; unique, sorted.
+    /// Name in the input; unique, sorted.
     pub name: String,
     /// Which camera took it.
     pub camera_id: u32,
     /// World to camera.
     pub pose: Pose,
-    /// The photograph as the user handed it in.
+    /// The original photograph.
     pub image: BlobRef,
     /// Its mask.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub mask: Option<BlobRef>,
 }
 
-/// What a coordinator plans from and a worker fetches by.
+/// The description of a scene from which a coordinator plans and a worker fetches files.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Manifest {
     /// Version of this layout: 1.
     pub format: u32,
-    /// What the scene was read from.
+    /// Format of the input.
     pub source: String,
-    /// Cameras by ascending id, as the input gives them; the worker undistorts.
+    /// Cameras by ascending id, as in the input; the worker undistorts.
     pub cameras: Vec<Camera>,
     /// Views by ascending name.
     pub views: Vec<ManifestView>,
-    /// [`super::Points`] in their binary form.
+    /// [`super::Points`] in their binary format.
     pub points: BlobRef,
 }
 
 impl Manifest {
-    /// The version of the layout that this program writes and reads.
+    /// The layout version that this program writes and reads.
     pub const FORMAT: u32 = 1;
 
-    /// The JSON form; the same manifest gives the same bytes.
+    /// The JSON text; equal manifests give equal bytes.
     ///
     /// # Errors
-    /// When a number is not finite: JSON has no word for it.
+    /// When a number is not finite, which JSON cannot represent.
     pub fn to_json(&self) -> Result<Vec<u8>> {
         serde_json::to_vec(self).map_err(|error| CoreError::Scene(format!("manifest: {error}")))
     }
 
-    /// The manifest of [`Manifest::to_json`], checked: it may come from anybody.
+    /// Parses and checks the output of [`Manifest::to_json`], which may be untrusted.
     ///
     /// # Errors
-    /// When the JSON is of another layout or the manifest contradicts itself.
+    /// When the JSON has another layout or the manifest contradicts itself.
     pub fn from_json(bytes: &[u8]) -> Result<Self> {
         let manifest: Self = serde_json::from_slice(bytes)
             .map_err(|error| CoreError::Scene(format!("manifest: not of the known layout: {error}")))?;
@@ -87,7 +87,7 @@ impl Manifest {
         }
         if let Some(pair) = self.views.windows(2).find(|pair| pair[0].name >= pair[1].name) {
             return Err(format!(
-                "views are not sorted by unique names: \"{}\" stands before \"{}\"",
+                "views are not sorted by unique names: \"{}\" precedes \"{}\"",
                 pair[0].name, pair[1].name
             ));
         }
@@ -122,7 +122,7 @@ impl BlobRef {
         Self { digest: blake3::hash(bytes).to_hex().to_string(), bytes: bytes.len() as u64 }
     }
 
-    /// Whether the digest is 64 lower-case hex digits: it becomes part of paths.
+    /// Whether the digest is 64 lower-case hex digits, because it becomes part of paths.
     pub fn is_well_formed(&self) -> bool {
         self.digest.len() == 64 && self.digest.bytes().all(|b| matches!(b, b'0'..=b'9' | b'a'..=b'f'))
     }
@@ -167,7 +167,7 @@ mod tests {
     }
 
     #[test]
-    fn a_manifest_that_contradicts_itself_is_refused_with_the_reason() {
+    fn a_contradictory_manifest_is_refused_with_the_reason() {
         let refused = |change: &dyn Fn(&mut Manifest)| {
             let mut manifest = sample();
             change(&mut manifest);

@@ -1,6 +1,6 @@
-//! Scenes as they come in: cameras, poses, sparse points and where the pictures are.
+//! Reads scenes: cameras, poses, sparse points and the paths of the pictures.
 //!
-//! [`load_scene`] finds out what a folder or file is, reads it, and checks everything that can be checked
+//! [`load_scene`] detects the format of a folder or file, reads it, and checks everything that can be checked
 //! without decoding a picture. Readers only read; `assemble` holds the rules that all inputs share.
 
 mod assemble;
@@ -39,25 +39,24 @@ use crate::config::DataConfig;
 use crate::{CoreError, Result};
 use files::check_name;
 
-/// What a scene is read for.
+/// The purpose for which a scene is read.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Purpose {
-    /// To look at: photographs and points may be missing, and what training would refuse is a warning.
+    /// To inspect: photographs and points may be missing, and faults that training refuses are warnings.
     Inspect,
-    /// To measure a model on: every view that remains has its photograph, of the size of its camera.
+    /// To measure a model: every view that remains has its photograph, of the size of its camera.
     Measure,
-    /// To train: as [`Purpose::Measure`], and there are points, and views that are not held out.
+    /// To train: as [`Purpose::Measure`], with points and with views that are not held out.
     Train,
 }
 
 /// Reads the scene at `path`: a COLMAP folder or model, a folder with `transforms.json` or `cameras.json`, or
-/// one of these two files itself. Where several are there, COLMAP comes before nerfstudio before 3DGS.
+/// one of these two files itself. If a folder has several, COLMAP precedes nerfstudio, and nerfstudio 3DGS.
 ///
-/// Nothing of the pictures is decoded; their headers are read. What was left out or chosen is in
-/// [`Scene::warnings`].
+/// Of the pictures only the headers are read. [`Scene::warnings`] states what was left out or chosen.
 ///
 /// # Errors
-/// [`CoreError::Input`] with the file, the place in it, what is wrong and what helps.
+/// [`CoreError::Input`] with the file, the place in it, the fault and the remedy.
 pub fn load_scene(path: &Path, purpose: Purpose, options: &DataConfig) -> Result<Scene> {
     let root = std::fs::canonicalize(path).map_err(CoreError::io("read", path))?;
     let draft = if root.is_file() { read_file(&root, purpose)? } else { read_folder(&root, purpose)? };
@@ -72,11 +71,11 @@ fn read_file(file: &Path, purpose: Purpose) -> Result<assemble::Draft> {
         Some(b'{') => nerfstudio::read(file, file, purpose),
         _ if bytes.starts_with(b"ply") => Err(CoreError::input(
             file,
-            "is a PLY, and a scene is photographs or cameras; models are for `fathom render` and `fathom eval`",
+            "is a PLY; a scene consists of photographs or cameras; use models with `fathom render` and `fathom eval`",
         )),
         _ => Err(CoreError::input(
             file,
-            "is neither a transforms.json nor a cameras.json; for COLMAP give the folder that holds images/ and sparse/",
+            "is neither a transforms.json nor a cameras.json; for COLMAP, give the folder that holds images/ and sparse/",
         )),
     }
 }
@@ -114,7 +113,7 @@ pub struct Points {
     pub positions: Vec<[f32; 3]>,
     /// sRGB colours.
     pub colours: Vec<[u8; 3]>,
-    /// Which views saw each point, where the input says so.
+    /// The views that see each point, if the input has tracks.
     #[serde(default)]
     pub tracks: Tracks,
 }
@@ -122,25 +121,25 @@ pub struct Points {
 /// One photograph: its camera, its pose and its files.
 #[derive(Clone, Debug, PartialEq)]
 pub struct View {
-    /// Name by the input, with `/` between folders; unique.
+    /// Name in the input, with `/` between folders; unique.
     pub name: String,
-    /// Its place in the list of the input, from 0; by name where the input is a COLMAP model, whose ids say
-    /// nothing.
+    /// Its index in the list of the input, from 0. For COLMAP models it is the index by name, because their
+    /// ids carry no order.
     pub listed_at: u32,
     /// Which camera took it.
     pub camera_id: u32,
     /// World to camera.
     pub pose: Pose,
-    /// The photograph; `None` where a scene has poses only.
+    /// The photograph; `None` if it is missing.
     pub image: Option<PathBuf>,
     /// Its mask.
     pub mask: Option<PathBuf>,
 }
 
-/// A scene that was read. Views are sorted by name; nothing of the pictures is loaded.
+/// A scene. Views are sorted by name; no picture is loaded.
 #[derive(Clone, Debug)]
 pub struct Scene {
-    /// What it was read from: "COLMAP binary", "COLMAP text", "nerfstudio", "cameras.json".
+    /// Its format: "COLMAP binary", "COLMAP text", "nerfstudio", "cameras.json".
     pub source: &'static str,
     /// The folder or file that was given.
     pub root: PathBuf,
@@ -148,9 +147,9 @@ pub struct Scene {
     pub cameras: Vec<Camera>,
     /// Views by ascending name.
     pub views: Vec<View>,
-    /// Sparse points; may be empty where only poses are needed.
+    /// Sparse points; may be empty if only poses are needed.
     pub points: Points,
-    /// What the user should know: skipped, missing, chosen.
+    /// Warnings for the user about skipped, missing and chosen inputs.
     pub warnings: Vec<String>,
 }
 

@@ -1,8 +1,8 @@
-//! nerfstudio's `transforms.json` (also the form of instant-ngp and of synthetic NeRF data).
+//! Reads nerfstudio's `transforms.json` (also the format of instant-ngp and of synthetic NeRF data).
 //!
 //! `transform_matrix` is camera to world with x right, y up, z backward (OpenGL); a [`Pose`] is its inverse
-//! with y and z turned. Intrinsics stand in the frame or at the top; the frame wins. Distortion coefficients
-//! count whatever `camera_model` says, because files without that key are common.
+//! with y and z negated. Intrinsics are in the frame or at the top; the frame wins. Distortion coefficients
+//! count even without `camera_model`, because files without that key are common.
 
 use std::path::{Path, PathBuf};
 
@@ -35,7 +35,7 @@ struct Frame {
     intrinsics: Intrinsics,
 }
 
-/// Keys that may stand at the top or in a frame. Sizes are floats because some writers write `1080.0`.
+/// Keys that may be at the top or in a frame. Sizes are floats because some writers write `1080.0`.
 #[derive(Clone, Default, Deserialize)]
 struct Intrinsics {
     camera_model: Option<String>,
@@ -57,10 +57,9 @@ struct Intrinsics {
 
 pub(super) fn read(root: &Path, file: &Path, purpose: Purpose) -> Result<Draft> {
     let bytes = std::fs::read(file).map_err(CoreError::io("read", file))?;
-    // Python writes NaN and Infinity, which JSON does not have; serde_json then names line and column.
-    let transforms: Transforms = serde_json::from_slice(&bytes).map_err(|error| {
-        CoreError::input(file, format!("not a transforms.json that can be used: {error}"))
-    })?;
+    // Python writes NaN and Infinity, which are not JSON; serde_json then names line and column.
+    let transforms: Transforms = serde_json::from_slice(&bytes)
+        .map_err(|error| CoreError::input(file, format!("not a usable transforms.json: {error}")))?;
     let folder = file.parent().unwrap_or(root).to_owned();
 
     let mut warnings = Vec::new();
@@ -71,7 +70,8 @@ pub(super) fn read(root: &Path, file: &Path, purpose: Purpose) -> Result<Draft> 
             file.display()
         ));
     }
-    // For frames without w and h whose photograph is missing: a set is of one size where no size is written.
+    // For frames without w and h whose photograph is missing: without written sizes, all photographs have one
+    // size.
     let some_photograph = transforms
         .frames
         .iter()
@@ -132,7 +132,7 @@ fn photograph_path(folder: &Path, file_path: &str) -> PathBuf {
     if path.extension().is_none() { path.with_extension("png") } else { path }
 }
 
-/// The points and the file that they come from, or should come from.
+/// The file of the points, and the points.
 fn read_points(
     folder: &Path,
     file: &Path,
@@ -141,7 +141,7 @@ fn read_points(
 ) -> Result<(PathBuf, Points)> {
     let ply = match ply_file_path {
         Some(path) => folder.join(path),
-        // The name that nerfstudio gives it; some files of older versions have it without the key.
+        // nerfstudio's file name; some older versions write the file without the key.
         None => folder.join("sparse_pc.ply"),
     };
     if !ply.is_file() {
@@ -165,7 +165,7 @@ fn read_points(
 }
 
 impl Intrinsics {
-    /// Each key from here, else from `fallback`.
+    /// Each key from here, otherwise from `fallback`.
     fn or(&self, fallback: &Self) -> Self {
         let (a, b) = (self, fallback);
         Self {
@@ -187,12 +187,13 @@ impl Intrinsics {
         }
     }
 
-    /// The camera, its id still 0. Without `w` and `h` the size is that of the photograph.
+    /// The camera, with id 0. Without `w` and `h` the size is that of the photograph.
     fn camera(&self, photograph: &Path) -> Result<Camera, String> {
         let (width, height) = match (self.w, self.h) {
             (Some(w), Some(h)) => (side("w", w)?, side("h", h)?),
-            _ => picture::dimensions(photograph)
-                .map_err(|error| format!("w and h are not given, and the photograph cannot tell: {error}"))?,
+            _ => picture::dimensions(photograph).map_err(|error| {
+                format!("w and h are not given, and the size of the photograph is unknown: {error}")
+            })?,
         };
         let (w, h) = (f64::from(width), f64::from(height));
         let from_angle = |angle: f64, side: f64| 0.5 * side / (0.5 * angle).tan();
@@ -240,7 +241,7 @@ fn pose(matrix: &[Vec<Option<f64>>]) -> Result<Pose, String> {
     if !shape {
         return Err("transform_matrix must have 3 or 4 rows of 4 numbers".to_owned());
     }
-    // serde_json reads null where other writers put NaN.
+    // Some writers put null for NaN.
     let entry = |row: usize, column: usize| matrix[row][column].unwrap_or(f64::NAN);
     let column = |index: usize| DVec3::new(entry(0, index), entry(1, index), entry(2, index));
     let rotation = DMat3::from_cols(column(0), column(1), column(2));
@@ -249,10 +250,10 @@ fn pose(matrix: &[Vec<Option<f64>>]) -> Result<Pose, String> {
         .map_err(|message| format!("transform_matrix {message}"))
 }
 
-/// World to camera from camera axes in world coordinates (columns) and the camera's centre. `signs` turns the
+/// World to camera from camera axes in world coordinates (columns) and the camera's centre. `signs` flips
 /// axes.
 ///
-/// A common scale of the axes is taken out; anything else that is no rotation is refused.
+/// A common scale of the axes is removed; any other deviation from a rotation is refused.
 pub(super) fn rigid_pose(axes: DMat3, centre: DVec3, signs: DVec3) -> Result<Pose, String> {
     if !axes.is_finite() || !centre.is_finite() {
         return Err(
@@ -262,7 +263,7 @@ pub(super) fn rigid_pose(axes: DMat3, centre: DVec3, signs: DVec3) -> Result<Pos
     let scale = axes.determinant().cbrt();
     let rigid = scale > 1e-9 && {
         let gram = (axes.transpose() * axes) * (1.0 / (scale * scale));
-        // Files round to six digits or hold f32; real shears and mirrors are far above this.
+        // Files round to six digits or hold f32; real shears and reflections are far above this.
         gram.abs_diff_eq(DMat3::IDENTITY, 1e-3)
     };
     if !rigid {

@@ -1,4 +1,4 @@
-//! A flight around a model of which nothing else is known: no cameras, no scale.
+//! A circular flight around a model without known cameras or scale.
 
 use std::f64::consts::TAU;
 
@@ -8,10 +8,11 @@ use super::{PinholeCamera, Pose};
 use crate::gaussians::Gaussians;
 use crate::{CoreError, Result};
 
-/// Distance of the cameras, in median distances of the Gaussians: what is scanned from all sides fills
-/// [`FIELD_OF_VIEW_DEGREES`], and a shell of sky or open water around everything stays behind the cameras.
+/// Distance of the cameras, in median distances of the Gaussians from the centre. An object that was scanned
+/// from all sides fills [`FIELD_OF_VIEW_DEGREES`]. A shell of sky or open water around the scene stays behind
+/// the cameras.
 const DISTANCE: f64 = 2.0;
-/// How high the cameras stand, degrees above the middle.
+/// Elevation of the cameras above the centre, degrees.
 const ELEVATION_DEGREES: f64 = 20.0;
 /// Field of view of the shorter side.
 const FIELD_OF_VIEW_DEGREES: f64 = 60.0;
@@ -21,17 +22,17 @@ const LEAST_LOGIT: f32 = -5.537_334_3;
 /// A circle of cameras.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Orbit {
-    /// What they look at, world.
+    /// The point that they look at, world.
     pub centre: DVec3,
     /// Their distance from it, scene units.
     pub radius: f64,
 }
 
 impl Orbit {
-    /// Around the median of the Gaussians that can be seen, so that strays do not count.
+    /// An orbit around the median of the visible Gaussians, so that outliers do not count.
     ///
     /// # Errors
-    /// [`CoreError::Scene`] when the model has no Gaussian that can be seen.
+    /// [`CoreError::Scene`] when the model has no visible Gaussian.
     pub fn around(model: &Gaussians) -> Result<Self> {
         let seen: Vec<(DVec3, f64)> = (0..model.len())
             .map(|index| {
@@ -44,17 +45,17 @@ impl Orbit {
             .collect();
         let axis = |axis: usize| median(seen.iter().map(|(mean, _)| mean[axis]).collect());
         let nothing = || {
-            CoreError::Scene("the model has no Gaussian that can be seen; nothing to fly around".to_owned())
+            CoreError::Scene("the model has no visible Gaussian; there is nothing to fly around".to_owned())
         };
         let (Some(x), Some(y), Some(z)) = (axis(0), axis(1), axis(2)) else { return Err(nothing()) };
         let centre = DVec3::new(x, y, z);
-        // Two deviations of a Gaussian belong to it: one alone has no other size.
+        // A Gaussian reaches two standard deviations; a model of a single one has no other size.
         let reach = median(seen.iter().map(|(mean, scale)| mean.distance(centre) + 2.0 * scale).collect());
         Ok(Self { centre, radius: DISTANCE * reach.ok_or_else(nothing)? })
     }
 
-    /// `count` poses at even angles, once around `up`, from a little above; the first looks along +z as far
-    /// as it can.
+    /// `count` poses at even angles, once around `up`, from slightly above. The first looks along +z as
+    /// closely as possible.
     pub fn poses(&self, up: DVec3, count: u32) -> impl ExactSizeIterator<Item = Pose> {
         let up = up.normalize();
         let forward = if up.z.abs() < 0.9 { DVec3::Z } else { DVec3::Y };
@@ -77,7 +78,7 @@ impl Orbit {
     }
 }
 
-/// The middle of the sorted values, the upper one of two; `None` of none.
+/// The median; the upper one of two. `None` without values.
 fn median(mut values: Vec<f64>) -> Option<f64> {
     let middle = values.len() / 2;
     (!values.is_empty()).then(|| *values.select_nth_unstable_by(middle, f64::total_cmp).1)
@@ -87,7 +88,7 @@ fn median(mut values: Vec<f64>) -> Option<f64> {
 mod tests {
     use super::*;
 
-    /// A ball of Gaussians of radius 1 around `centre`, and some far away, not finite, or not to be seen.
+    /// A ball of Gaussians of radius 1 around `centre`, and some that are far away, not finite or invisible.
     fn ball(centre: DVec3) -> Gaussians {
         let mut model = Gaussians::empty(0);
         let mut push = |mean: DVec3, logit: f32| {
@@ -112,7 +113,7 @@ mod tests {
     }
 
     #[test]
-    fn strays_and_what_cannot_be_seen_do_not_move_the_orbit() {
+    fn outliers_and_invisible_gaussians_do_not_move_the_orbit() {
         let centre = DVec3::new(10.0, -3.0, 5.0);
         let orbit = Orbit::around(&ball(centre)).expect("an orbit");
         // Means are f32.
@@ -121,7 +122,7 @@ mod tests {
     }
 
     #[test]
-    fn every_camera_of_an_orbit_looks_at_the_middle_from_above_with_up_in_the_picture() {
+    fn every_camera_of_an_orbit_looks_at_the_centre_from_above() {
         let orbit = Orbit { centre: DVec3::new(1.0, 2.0, 3.0), radius: 4.0 };
         for up in [DVec3::X, DVec3::NEG_Y, DVec3::Z, DVec3::new(1.0, 1.0, 0.2)] {
             let poses: Vec<Pose> = orbit.poses(up, 12).collect();
@@ -142,10 +143,10 @@ mod tests {
     }
 
     #[test]
-    fn one_gaussian_has_an_orbit_and_none_has_not() {
+    fn one_gaussian_has_an_orbit_and_an_empty_model_has_none() {
         let mut one = Gaussians::empty(0);
         let refused = Orbit::around(&one).map(|_| ()).map_err(|error| error.to_string());
-        assert!(refused.is_err_and(|said| said.contains("no Gaussian")));
+        assert!(refused.is_err_and(|said| said.contains("no visible Gaussian")));
         one.means.push([1.0; 3]);
         one.quats.push([1.0, 0.0, 0.0, 0.0]);
         one.log_scales.push([0.0, -1.0, -1.0]);

@@ -1,9 +1,9 @@
 //! A smooth flight through given cameras.
 //!
-//! Centres follow a centripetal Catmull-Rom spline (Yuksel et al. 2011: no loops, no cusps between keys),
-//! walked by arc length, so that the speed is even however the keys are spaced. Rotations follow cumulative
-//! cubic Bezier curves of unit quaternions (Kim, Kim and Shin 1995) on the shortest arcs. Intrinsics change
-//! linearly.
+//! Centres follow a centripetal Catmull-Rom spline (Yuksel et al. 2011: no loops, no cusps between keys). It
+//! is parametrised by arc length, so that the speed is even for any spacing of the keys. Rotations follow
+//! cumulative cubic Bezier curves of unit quaternions (Kim, Kim and Shin 1995) on the shortest arcs.
+//! Intrinsics change linearly.
 
 use std::f64::consts::FRAC_PI_2;
 
@@ -12,10 +12,10 @@ use glam::{DQuat, DVec3};
 use super::{PinholeCamera, Pose};
 use crate::{CoreError, Result};
 
-/// Pieces in which the length of a curve is measured.
+/// Number of pieces for measuring the length of a curve.
 const PIECES: usize = 32;
-/// The fastest a rotation may pass a key, in mean speeds of the slower of the two segments there: a cubic
-/// with end slopes of at most three times the mean does not overshoot (Fritsch and Carlson 1980).
+/// Largest angular velocity at a key, in mean velocities of the slower of its two segments. A cubic with end
+/// slopes of at most three times the mean does not overshoot (Fritsch and Carlson 1980).
 const MOST_SPEED: f64 = 3.0;
 
 /// A path through key cameras. Time runs from 0 at the first to 1 at the last.
@@ -32,12 +32,12 @@ struct Key {
     camera_to_world: DQuat,
 }
 
-/// The way from a key to the next one.
+/// The part of a path from one key to the next.
 #[derive(Clone, Debug)]
 struct Segment {
     from: Key,
     to: Key,
-    /// When it is left for the next one, in units of durations.
+    /// Time of its end, in the unit of durations.
     end: f64,
     duration: f64,
     curve: Curve,
@@ -45,21 +45,21 @@ struct Segment {
     turns: [DVec3; 3],
 }
 
-/// A cubic between two points, by its derivatives there; parameter 0 to 1.
+/// A cubic between two points with given derivatives; parameter 0 to 1.
 #[derive(Clone, Debug)]
 struct Curve {
     ends: [DVec3; 2],
     tangents: [DVec3; 2],
-    /// Its length up to each border of its [`PIECES`].
+    /// Length up to each border of the [`PIECES`].
     lengths: Vec<f64>,
 }
 
 impl CameraPath {
-    /// The path through `keys` in their order; one key is a path that stays there.
+    /// The path through `keys` in their order; with one key it stays there.
     ///
     /// # Errors
-    /// [`CoreError::Scene`] without keys, with cameras of different sizes, or with numbers that are not
-    /// finite.
+    /// [`CoreError::Scene`] without keys, with cameras of different sizes, with unsound poses or with
+    /// intrinsics that are not finite.
     pub fn new(keys: &[(PinholeCamera, Pose)]) -> Result<Self> {
         let refuse = |message: String| Err(CoreError::Scene(format!("camera path: {message}")));
         let Some((first, _)) = keys.first() else {
@@ -90,10 +90,10 @@ impl CameraPath {
         Ok(Self { segments: segments(&keys), last: keys[keys.len() - 1] })
     }
 
-    /// Camera and pose at `time`, 0 to 1; beyond it, those of the ends.
+    /// Camera and pose at `time`, 0 to 1; outside that range, those of the ends.
     pub fn at(&self, time: f64) -> (PinholeCamera, Pose) {
         let now = time.max(0.0) * self.segments.last().map_or(0.0, |last| last.end);
-        // Two keys alike make a segment that takes no time: it is over when it begins.
+        // Two equal keys make a segment without duration, which is skipped.
         let index = self.segments.partition_point(|segment| segment.end <= now);
         let Some(segment) = self.segments.get(index) else {
             return (self.last.camera, pose(self.last.centre, self.last.camera_to_world));
@@ -104,7 +104,7 @@ impl CameraPath {
         (mixed(&from.camera, &to.camera, share), pose(centre, segment.camera_to_world(share)))
     }
 
-    /// `count` cameras at even times, the first and the last key among them; one is the first key.
+    /// `count` cameras at even times, including the first and the last key. A single camera is the first key.
     pub fn frames(&self, count: u32) -> impl ExactSizeIterator<Item = (PinholeCamera, Pose)> {
         let last = f64::from(count.saturating_sub(1).max(1));
         (0..count).map(move |index| self.at(f64::from(index) / last))
@@ -142,7 +142,7 @@ impl Curve {
         let left = walked - self.lengths[piece];
         let mut u = begin + (end - begin) * left / (self.lengths[piece + 1] - self.lengths[piece]);
         if !u.is_finite() {
-            // A piece without length: the curve stays where it is.
+            // The piece has no length, so all its points are equal.
             return self.at(begin);
         }
         // Newton's method; the speed hardly changes inside a piece.
@@ -178,7 +178,7 @@ impl Curve {
     }
 }
 
-/// Where piece `index` of a curve begins.
+/// Parameter at which piece `index` of a curve begins.
 fn border(index: usize) -> f64 {
     index as f64 / PIECES as f64
 }
@@ -211,14 +211,14 @@ fn segments(keys: &[Key]) -> Vec<Segment> {
 /// The rotation from `a` to `b` on the shortest arc, as a rotation vector in the frame of `a`.
 fn turn(a: DQuat, b: DQuat) -> DVec3 {
     let between = a.inverse() * b;
-    // The other half of the sphere is the long way round.
+    // A negative w means the longer arc.
     (if between.w < 0.0 { -between } else { between }).to_scaled_axis()
 }
 
-/// The curves between points (centripetal Catmull-Rom: knots are apart by the root of the distance).
+/// The curves between points (centripetal Catmull-Rom: the knot spacing is the square root of the distance).
 fn curves(points: &[DVec3]) -> Vec<Curve> {
     let knots = |a: DVec3, b: DVec3| a.distance(b).sqrt();
-    // The slope at `at`, per knot, between its neighbours; a neighbour in the same place is no neighbour.
+    // The slope per knot at `at`, from its neighbours; a neighbour at the same position does not count.
     let slope = |before: DVec3, at: DVec3, after: DVec3| {
         let (d0, d1) = (knots(before, at), knots(at, after));
         if d0 > 0.0 && d1 > 0.0 {
@@ -230,7 +230,7 @@ fn curves(points: &[DVec3]) -> Vec<Curve> {
     (1..points.len())
         .map(|next| {
             let (p1, p2) = (points[next - 1], points[next]);
-            // Beyond the ends the path would go straight on.
+            // Beyond the ends the path continues straight.
             let p0 = if next >= 2 { points[next - 2] } else { 2.0 * p1 - p2 };
             let p3 = if next + 1 < points.len() { points[next + 1] } else { 2.0 * p2 - p1 };
             let d = knots(p1, p2);
@@ -239,20 +239,21 @@ fn curves(points: &[DVec3]) -> Vec<Curve> {
         .collect()
 }
 
-/// How long each segment takes: its length, but a turn by a right angle takes as long as the mean segment. So
-/// a camera that turns on the spot does not jump, and one that moves along keeps its speed.
+/// Duration of each segment: its length, but at least the time for its rotation, where a right angle takes as
+/// long as a mean segment. So a camera that rotates on the spot does not jump, and a moving one keeps its
+/// speed.
 fn durations(curves: &[Curve], angles: &[DVec3]) -> Vec<f64> {
     let moved: f64 = curves.iter().map(Curve::length).sum();
     let per_radian = if moved > 0.0 { moved / curves.len() as f64 / FRAC_PI_2 } else { 1.0 };
     let needed =
         curves.iter().zip(angles).map(|(curve, angle)| curve.length().max(per_radian * angle.length()));
     let durations: Vec<f64> = needed.collect();
-    // Keys in one place that look one way: any time will do, so that frames have somewhere to be.
+    // All keys are equal: any duration above 0 works.
     if durations.iter().sum::<f64>() > 0.0 { durations } else { vec![1.0; durations.len()] }
 }
 
-/// Angular velocity at each key, in its camera's frame: the mean of both sides, limited so that no side
-/// overshoots; at the ends that of the one side.
+/// Angular velocity at each key, in its camera's frame: the mean of both sides, limited so that neither side
+/// overshoots. At the ends it is that of the only side.
 fn angular_velocities(angles: &[DVec3], durations: &[f64]) -> Vec<DVec3> {
     let velocity = |index: usize| {
         if durations[index] > 0.0 { angles[index] / durations[index] } else { DVec3::ZERO }
@@ -269,7 +270,7 @@ fn angular_velocities(angles: &[DVec3], durations: &[f64]) -> Vec<DVec3> {
         .collect()
 }
 
-/// Focal lengths and principal point in between.
+/// The camera with interpolated focal lengths and principal point.
 fn mixed(from: &PinholeCamera, to: &PinholeCamera, share: f64) -> PinholeCamera {
     let mix = |a: f64, b: f64| a + (b - a) * share;
     PinholeCamera {
@@ -297,13 +298,13 @@ mod tests {
         CameraPath::new(keys).map(|_| ()).expect_err("a refusal").to_string()
     }
 
-    /// When each key is passed, 0 to 1.
+    /// The time of each key, 0 to 1.
     fn key_times(path: &CameraPath) -> Vec<f64> {
         let total = path.segments.last().map_or(1.0, |last| last.end);
         std::iter::once(0.0).chain(path.segments.iter().map(|segment| segment.end / total)).collect()
     }
 
-    /// Unevenly spaced keys on a winding way, looking here and there.
+    /// Unevenly spaced keys on a winding path, with changing directions.
     fn winding() -> Vec<Pose> {
         [
             ([0.0, 0.0, 0.0], [0.0, 0.0, 5.0]),
@@ -329,7 +330,7 @@ mod tests {
         let times = key_times(&path);
         assert!(times.is_sorted(), "{times:?}");
         for (time, key) in times.iter().zip(&poses) {
-            // Rounding of times near a key is magnified by the speed there.
+            // The speed at a key magnifies the rounding of times.
             let (_, pose) = path.at(*time);
             assert!(
                 pose.centre().distance(key.centre()) < 1e-9,
@@ -347,19 +348,19 @@ mod tests {
     }
 
     #[test]
-    fn the_speed_is_even_however_the_keys_are_spaced() {
+    fn the_speed_is_even_for_unevenly_spaced_keys() {
         let ahead = |pose: Pose| Pose::looking_at(pose.centre(), pose.centre() + DVec3::Z, DVec3::Y);
         let path = path(&winding().into_iter().map(ahead).collect::<Vec<_>>());
         let centres: Vec<DVec3> = path.frames(20_000).map(|(_, pose)| pose.centre()).collect();
         let steps: Vec<f64> = centres.windows(2).map(|pair| pair[0].distance(pair[1])).collect();
         let mean = steps.iter().sum::<f64>() / steps.len() as f64;
         let worst = steps.iter().map(|step| (step / mean - 1.0).abs()).fold(0.0, f64::max);
-        // Quadrature of the lengths, and chords across bends: 1.2e-5.
+        // Quadrature of the lengths and chords across bends cause 1.2e-5.
         assert!(worst < 1e-4, "a step is {worst} off the mean {mean}");
     }
 
     #[test]
-    fn rotations_stay_unit_and_turn_without_a_jump_whatever_the_signs_of_quaternions() {
+    fn rotations_are_smooth_for_any_signs_of_quaternions() {
         let poses = winding();
         let mut turned = poses.clone();
         for pose in turned.iter_mut().step_by(2) {
@@ -388,7 +389,8 @@ mod tests {
             let (x, z) = degrees.to_radians().sin_cos();
             Pose::looking_at(DVec3::ZERO, DVec3::new(x, 0.0, z), DVec3::Y)
         };
-        // From 170 to 190 degrees, over 180 and not over 0: on the spot, so turning alone must take the time.
+        // From 170 to 190 degrees, through 180 and not through 0. The camera does not move, so the rotation
+        // alone determines the time.
         let path = path(&[looking(170.0), looking(190.0)]);
         let middle = path.at(0.5).1.forward();
         assert!(middle.distance(DVec3::NEG_Z) < 1e-6, "{middle}");
@@ -406,7 +408,8 @@ mod tests {
             looking(2.0 * DVec3::X, DVec3::X),
         ]);
         let times = key_times(&path);
-        // A right angle takes as long as the mean of the three segments, of which two are 1 long: 2/3.
+        // A right angle takes as long as the mean of the three segments. Two of them have length 1, so this
+        // is 2/3.
         assert!((times[2] - times[1] - (2.0 / 3.0) / (8.0 / 3.0)).abs() < 1e-9, "{times:?}");
         let (_, half_way) = path.at((times[1] + times[2]) / 2.0);
         assert!((half_way.centre() - DVec3::X).length() < 1e-9);
@@ -414,7 +417,7 @@ mod tests {
     }
 
     #[test]
-    fn one_key_two_keys_and_keys_alike_make_a_path() {
+    fn one_key_two_keys_and_equal_keys_make_a_path() {
         let pose = Pose::looking_at(DVec3::X, DVec3::ZERO, DVec3::Y);
         for keys in [&[pose][..], &[pose, pose], &[pose, pose, pose]] {
             for (camera, at) in path(keys).frames(3) {
@@ -428,7 +431,7 @@ mod tests {
             assert!(frame.1.centre().distance(x * DVec3::X) < 1e-9, "{}", frame.1.centre());
         }
         assert_eq!(two.frames(1).len(), 1);
-        // A key that is listed twice is passed as if it were listed once.
+        // A key that is listed twice counts once.
         let doubled = path(&[pose, pose, away]);
         assert!(doubled.at(0.5).1.centre().distance(2.0 * DVec3::X) < 1e-9);
     }

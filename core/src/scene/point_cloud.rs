@@ -1,5 +1,5 @@
-//! Sparse points from a PLY file of any program: ASCII or binary, positions of any number type, colours if
-//! any.
+//! Reads sparse points from a PLY file of any program: ASCII or binary, positions of any number type, colours
+//! if present.
 
 use std::path::Path;
 
@@ -7,7 +7,7 @@ use super::Points;
 use crate::ply::header::{Format, Header, Scalar};
 use crate::{CoreError, Result};
 
-/// The points and the number of those that [`Points::push`] leaves out.
+/// The points, and the number of those that [`Points::push`] refuses.
 pub(super) fn read(path: &Path) -> Result<(Points, usize)> {
     let bytes = std::fs::read(path).map_err(CoreError::io("read", path))?;
     let refuse = |message: String| CoreError::input(path, message);
@@ -49,7 +49,7 @@ pub(super) fn read(path: &Path) -> Result<(Points, usize)> {
         }
         let colour = colours.map_or([127; 3], |columns| {
             columns.map(|column| match kinds[column] {
-                // Floats are 0..1 where programs write them.
+                // Programs that write floats use 0..1.
                 Scalar::F32 | Scalar::F64 => (row[column] * 255.0).round() as u8,
                 Scalar::U16 => (row[column] / 257.0).round() as u8,
                 _ => row[column] as u8,

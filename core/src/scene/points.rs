@@ -1,21 +1,21 @@
-//! Sparse points and their form on the wire.
+//! Sparse points and their binary format.
 //!
-//! Layout of [`Points::to_bytes`], little-endian, no padding, where it is known which views saw the points:
+//! Layout of [`Points::to_bytes`] for points with tracks, little-endian, no padding:
 //! ```text
 //! 0         8 bytes   "FTHMPTS2"
 //! 8         u64       N, the number of points
 //! 16        u64       M, the number of observations
 //! 24        N times   f32 x, f32 y, f32 z, u8 r, u8 g, u8 b    (15 bytes)
-//! 24 + 15N  N times   u32, how many views saw the point; M together
-//! 24 + 19N  M times   u32 view, index among the views of the scene by name; ascending by point, none twice
+//! 24 + 15N  N times   u32, number of views that see the point; M in total
+//! 24 + 19N  M times   u32 view, index among the views of the scene by name; ascending and unique for each point
 //! ```
-//! and where it is not (any version of Fathom reads this):
+//! and for points without tracks (any version of Fathom reads this):
 //! ```text
 //! 0         8 bytes   "FTHMPTS1"
 //! 8         u64       N
 //! 16        N times   as above
 //! ```
-//! The same points give the same bytes, so the digest of the bytes names them.
+//! Equal points give equal bytes, so the digest of the bytes identifies them.
 
 use glam::DVec3;
 
@@ -49,8 +49,7 @@ impl Points {
         self.positions.is_empty()
     }
 
-    /// Adds a point unless one of its coordinates is not finite or more than 1e12 scene units from the
-    /// origin; says whether it did.
+    /// Adds a point and returns true, unless a coordinate is not finite or beyond 1e12 scene units.
     pub fn push(&mut self, position: [f64; 3], colour: [u8; 3]) -> bool {
         let near = is_near(position.into());
         if near {
@@ -60,7 +59,7 @@ impl Points {
         near
     }
 
-    /// As [`Points::push`], for a point that is known to be seen by `views`, in any order.
+    /// As [`Points::push`], for a point that `views` see, in any order.
     pub fn push_seen(&mut self, position: [f64; 3], colour: [u8; 3], views: &mut Vec<u32>) -> bool {
         let pushed = self.push(position, colour);
         if pushed {
@@ -80,7 +79,7 @@ impl Points {
         points
     }
 
-    /// The binary form, described at the head of this file.
+    /// The binary format that the head of this file describes.
     pub fn to_bytes(&self) -> Vec<u8> {
         let seen = self.tracks.observations();
         let track_bytes = if seen > 0 { 8 + 4 * (self.len() + seen) } else { 0 };
@@ -110,8 +109,8 @@ impl Points {
     /// The points of [`Points::to_bytes`].
     ///
     /// # Errors
-    /// When the bytes are not of this layout, are torn, hold a coordinate that [`Points::push`] does not
-    /// take, or a track whose views are not ascending.
+    /// When the bytes have another layout, are truncated, hold a coordinate that [`Points::push`] refuses, or
+    /// a track whose views are not ascending.
     pub fn from_bytes(bytes: &[u8]) -> Result<Self> {
         let refuse = |message: String| CoreError::Scene(format!("sparse points: {message}"));
         let with_tracks = match bytes.get(..8) {
@@ -161,7 +160,7 @@ impl Points {
                 track.extend(own.chunks_exact(4).map(|view| word(view, 0)));
                 views = rest;
                 if !track.is_sorted_by(|a, b| a < b) {
-                    return Err(refuse(format!("the views that saw point {index} are not ascending")));
+                    return Err(refuse(format!("the views that see point {index} are not ascending")));
                 }
             }
             if !points.push_seen(position.map(f64::from), [entry[12], entry[13], entry[14]], &mut track) {
@@ -178,17 +177,17 @@ impl Points {
 
 /// 1.1 times the largest distance of a centre from their mean: the extent that 3DGS scales learning rates by.
 ///
-/// 0 for one centre or none, so nothing may be divided by it.
+/// It is 0 for at most one centre, so do not divide by it.
 pub fn extent(centres: &[DVec3]) -> f64 {
     let mean = centres.iter().sum::<DVec3>() / (centres.len().max(1)) as f64;
     1.1 * centres.iter().map(|centre| centre.distance(mean)).fold(0.0, f64::max)
 }
 
-/// What the learning rate of the means is in proportion to, scene units: [`extent`] as in 3DGS, but at most
-/// [`viewing_distance`].
+/// The length to which the learning rate of the means is proportional, scene units: [`extent`] as in 3DGS,
+/// but at most [`viewing_distance`].
 ///
-/// The two agree where cameras stand around an object. On a survey of 100 m from 7 m above the ground the
-/// extent is eight times as large, and so would be the steps in pixels.
+/// The two agree for cameras around an object. In a survey of 100 m from 7 m above the ground, the extent is
+/// eight times larger, and so would be the steps in pixels.
 pub fn learning_scale(extent: f64, viewing_distance: Option<f64>) -> f64 {
     match viewing_distance {
         Some(distance) if extent > 0.0 => extent.min(distance),
@@ -197,10 +196,10 @@ pub fn learning_scale(extent: f64, viewing_distance: Option<f64>) -> f64 {
     }
 }
 
-/// How far away what the cameras look at is: the median over views of the median depth of the sparse points
-/// in view, scene units. Views and points are thinned out evenly, at most 128 and 32,768.
+/// The scene scale: the median over views of the median depth of the sparse points in view, scene units. At
+/// most 128 views and 32,768 points are used, evenly spaced.
 ///
-/// `None` when no view has a point before it.
+/// `None` when no view shows a point.
 pub fn viewing_distance(views: &[(PinholeCamera, Pose)], points: &Points) -> Option<f64> {
     const VIEWS: usize = 128;
     const POINTS: usize = 32_768;
@@ -239,7 +238,7 @@ mod tests {
         }
     }
 
-    /// The second of four points was seen by nobody, the last neither.
+    /// No view sees the second and the last of four points.
     fn tracked() -> Points {
         let mut points = Points::default();
         for (x, mut views) in [(1.0, vec![7, 0, 3]), (2.0, vec![]), (3.0, vec![3, 3, 1]), (4.0, vec![])] {
@@ -249,7 +248,7 @@ mod tests {
     }
 
     #[test]
-    fn tracks_survive_the_way_through_bytes_and_are_sorted() {
+    fn tracks_are_sorted_and_survive_bytes() {
         let points = tracked();
         assert_eq!(
             [0, 1, 2, 3].map(|point| points.tracks.of(point).to_vec()),
@@ -264,7 +263,7 @@ mod tests {
     }
 
     #[test]
-    fn points_without_tracks_have_the_bytes_that_they_always_had() {
+    fn points_without_tracks_keep_their_first_format() {
         let mut old = b"FTHMPTS1".to_vec();
         old.extend(1_u64.to_le_bytes());
         for value in [1.0_f32, -2.0, 0.5] {
@@ -278,7 +277,7 @@ mod tests {
     }
 
     #[test]
-    fn torn_or_contradictory_tracks_are_refused() {
+    fn truncated_or_contradictory_tracks_are_refused() {
         let bytes = tracked().to_bytes();
         for len in 0..bytes.len() {
             assert!(Points::from_bytes(&bytes[..len]).is_err(), "{len} of {} bytes passed", bytes.len());
@@ -308,7 +307,7 @@ mod tests {
     }
 
     #[test]
-    fn points_survive_the_way_through_bytes() {
+    fn points_survive_bytes() {
         let bytes = sample().to_bytes();
         assert_eq!(bytes.len(), 16 + 2 * 15);
         assert_eq!(Points::from_bytes(&bytes).unwrap(), sample());
@@ -316,7 +315,7 @@ mod tests {
     }
 
     #[test]
-    fn torn_or_foreign_bytes_are_refused() {
+    fn truncated_or_foreign_bytes_are_refused() {
         let bytes = sample().to_bytes();
         for len in 0..bytes.len() {
             assert!(Points::from_bytes(&bytes[..len]).is_err(), "{len} of {} bytes passed", bytes.len());
@@ -352,7 +351,7 @@ mod tests {
     }
 
     #[test]
-    fn the_viewing_distance_is_the_usual_depth_of_what_is_in_view() {
+    fn the_viewing_distance_is_the_median_depth_in_view() {
         let (views, points) = survey();
         assert!((viewing_distance(&views, &points).unwrap() - 5.0).abs() < 1e-9);
         assert_eq!(viewing_distance(&views, &Points::default()), None);
@@ -363,7 +362,7 @@ mod tests {
     }
 
     #[test]
-    fn a_long_survey_does_not_make_the_steps_of_its_means_long() {
+    fn a_long_survey_does_not_raise_the_learning_scale() {
         let (views, points) = survey();
         let centres: Vec<DVec3> = views.iter().map(|(_, pose)| pose.centre()).collect();
         let (extent, distance) = (extent(&centres), viewing_distance(&views, &points));
@@ -371,6 +370,6 @@ mod tests {
         assert!((learning_scale(extent, distance) - 5.0).abs() < 1e-9);
         assert_eq!(learning_scale(3.0, distance), 3.0, "an orbit keeps the rates of 3DGS");
         assert_eq!(learning_scale(extent, None), extent);
-        assert!((learning_scale(0.0, distance) - 5.0).abs() < 1e-9, "one place of cameras has no extent");
+        assert!((learning_scale(0.0, distance) - 5.0).abs() < 1e-9, "cameras at one position have no extent");
     }
 }

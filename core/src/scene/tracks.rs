@@ -1,22 +1,22 @@
-//! Which views saw which sparse point: the tracks of structure from motion, without the pixels.
+//! The views that see each sparse point: tracks of structure from motion, without the pixels.
 
 use serde::{Deserialize, Serialize};
 
-/// For each point the views that saw it, as indices into the views of the scene by name; ascending, none
-/// twice.
+/// For each point the views that see it, as indices into the views of the scene by name; ascending and
+/// unique.
 ///
-/// 4 bytes an observation and 4 a point; points behind the last one that has a track take nothing, and a
-/// scene without tracks nothing at all.
+/// Takes 4 bytes an observation and 4 a point. Points after the last one with a track take no space, and
+/// neither does a scene without tracks.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Tracks {
-    /// Where the track of each point ends in `views`; it begins where that of the point before ends.
+    /// End of each point's track in `views`; it begins at the end of the previous one.
     ends: Vec<u32>,
     /// Tracks one after the other.
     views: Vec<u32>,
 }
 
 impl Tracks {
-    /// The views that saw this point; none where that is not known.
+    /// The views that see this point; none if unknown.
     pub fn of(&self, point: usize) -> &[u32] {
         let end = |index: usize| self.ends.get(index).map_or(self.views.len(), |end| *end as usize);
         let start = if point == 0 { 0 } else { end(point - 1) };
@@ -28,16 +28,16 @@ impl Tracks {
         self.views.len()
     }
 
-    /// Whether nothing is known of any point.
+    /// Whether no point has a track.
     pub fn is_empty(&self) -> bool {
         self.views.is_empty()
     }
 
-    /// Gives point `point` its track. Points get theirs in ascending order, those between have none.
+    /// Sets the track of `point`. Points get their tracks in ascending order; skipped points have none.
     pub(crate) fn set_last(&mut self, point: usize, views: &mut Vec<u32>) {
         views.sort_unstable();
         views.dedup();
-        // Offsets of 32 bits: four thousand million observations are more than any reconstruction has.
+        // Offsets have 32 bits: no reconstruction has 4e9 observations.
         let fits = self.views.len() + views.len() <= u32::MAX as usize;
         if views.is_empty() || !fits || point < self.ends.len() {
             return;
@@ -47,7 +47,8 @@ impl Tracks {
         self.ends.push(self.views.len() as u32);
     }
 
-    /// Renumbers the views: `new_index[old]`, or `None` where a view was left out. Ascending as the old ones.
+    /// Renumbers the views by `new_index[old]`, which is `None` for a view that was left out. New indices are
+    /// ascending.
     pub(super) fn renumber(&mut self, new_index: &[Option<u32>]) {
         let mut renumbered = Self::default();
         let mut track = Vec::new();
@@ -79,6 +80,6 @@ mod tests {
         );
         assert_eq!(tracks.observations(), 4);
         tracks.renumber(&[]);
-        assert_eq!(tracks, Tracks::default(), "nothing is kept of nothing");
+        assert_eq!(tracks, Tracks::default(), "no views, no tracks");
     }
 }

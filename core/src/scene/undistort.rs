@@ -1,18 +1,17 @@
-//! From a camera with lens distortion to the pinhole camera that training uses.
+//! Converts a camera with lens distortion to the pinhole camera that training uses.
 //!
-//! The rule: the pinhole has the size, the focal lengths and the principal point of the input camera. So no
-//! pixel is enlarged at the centre, cameras without distortion come out unchanged, and the result is known
-//! without any picture. What such a pinhole sees outside the photograph is masked; what the photograph shows
-//! outside it is lost.
+//! The pinhole has the size, the focal lengths and the principal point of the input camera. So the centre is
+//! not enlarged, cameras without distortion stay unchanged, and the result is known without any picture.
+//! Pixels of the pinhole outside the photograph are masked; parts of the photograph outside the pinhole are
+//! lost.
 //!
-//! A pixel of the result is found in the photograph by the forward distortion, which is exact; nothing is
-//! inverted.
+//! The forward distortion maps a pixel of the result to the photograph; it is exact, and nothing is inverted.
 
 use super::{Camera, CameraModel, PinholeCamera};
 use crate::{CoreError, Result};
 
-/// Radial and tangential distortion on the plane z = 1, as in OpenCV:
-/// factor (1 + k1 r^2 + k2 r^4 + k3 r^6 + k4 r^8) / (1 + d1 r^2 + d2 r^4 + d3 r^6), then p1 and p2.
+/// Radial and tangential distortion on the plane z = 1, as in OpenCV. The radial factor is `(1 + k1 r^2 + k2
+/// r^4 + k3 r^6 + k4 r^8) / (1 + d1 r^2 + d2 r^4 + d3 r^6)`; p1 and p2 are tangential.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 struct Distortion {
     numerator: [f64; 4],
@@ -26,7 +25,7 @@ pub(crate) struct Undistortion {
     pinhole: PinholeCamera,
     distortion: Distortion,
     /// Square of the radius on z = 1 up to which the distorted radius grows. Beyond it the polynomial folds
-    /// back and would show parts of the photograph twice.
+    /// back and would repeat parts of the photograph.
     r2_limit: f64,
 }
 
@@ -34,12 +33,13 @@ impl Camera {
     /// The pinhole camera of the undistorted photograph, of the size of the photograph.
     ///
     /// # Errors
-    /// When the model has no such camera (fisheye, division, panorama); the message says what to run.
+    /// When the model has no such camera (fisheye, division, panorama); the message states the command to
+    /// run.
     pub fn pinhole(&self) -> Result<PinholeCamera> {
         self.undistortion().map(|undistortion| undistortion.pinhole)
     }
 
-    /// How photographs of this camera become those of [`Camera::pinhole`].
+    /// The mapping from photographs of this camera to those of [`Camera::pinhole`].
     pub(crate) fn undistortion(&self) -> Result<Undistortion> {
         self.check().map_err(CoreError::Scene)?;
         let p = self.params.as_slice();
@@ -85,9 +85,9 @@ impl Undistortion {
         self.distortion == Distortion::default()
     }
 
-    /// Where the photograph shows what the pinhole shows at (`u`, `v`); pixels from the top-left corner.
+    /// The position in the photograph of the pinhole's (`u`, `v`); both in pixels from the top-left corner.
     ///
-    /// `None` outside the photograph and beyond the radius up to which the model holds.
+    /// `None` outside the photograph and beyond the radius where the model is valid.
     pub fn source_of(&self, u: f64, v: f64) -> Option<(f64, f64)> {
         let PinholeCamera { width, height, fx, fy, cx, cy } = self.pinhole;
         let (x, y) = ((u - cx) / fx, (v - cy) / fy);
@@ -160,7 +160,7 @@ mod tests {
     }
 
     #[test]
-    fn pinholes_come_out_as_they_are() {
+    fn pinholes_stay_unchanged() {
         let simple = camera(CameraModel::SimplePinhole, &[900.0, 501.0, 399.0]);
         let pinhole = simple.pinhole().unwrap();
         assert_eq!((pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy), (900.0, 900.0, 501.0, 399.0));
@@ -174,7 +174,8 @@ mod tests {
     fn distortion_is_that_of_opencv_and_colmap() {
         // cv2.projectPoints([[[0.3, -0.2, 1]]], 0, 0, K, dist) of OpenCV 5.0.0 with K = [[900, 0, 500], [0,
         // 910, 400], [0, 0, 1]] and dist the parameters below in the same order. `Camera.img_from_cam` of
-        // pycolmap 4.2.1 gives the same for these two, and the numbers of the first two models.
+        // pycolmap 4.2.1 gives the same for these two; it is the source of the values of the first two
+        // models.
         let lens = [900.0, 910.0, 500.0, 400.0, -0.1, 0.02, 0.001, -0.002, 0.003, 0.01, -0.004, 0.002];
         for (model, params, expected) in [
             (CameraModel::SimpleRadial, &[900.0, 500.0, 400.0, -0.12][..], (765.788, 222.808)),
@@ -210,14 +211,15 @@ mod tests {
 
     #[test]
     fn pixels_beyond_the_fold_of_the_polynomial_have_no_source() {
-        // r (1 - 0.9 r^2) turns round at r = sqrt(1 / 2.7) = 0.6086; the corner of this camera lies at 0.711.
+        // r (1 - 0.9 r^2) has its maximum at r = sqrt(1 / 2.7) = 0.6086; the corner of this camera is at
+        // 0.711.
         let strong = camera(CameraModel::SimpleRadial, &[900.0, 500.0, 400.0, -0.9]).undistortion().unwrap();
         assert!(strong.source_of(500.0 + 900.0 * 0.55, 400.0).is_some());
         assert!(strong.source_of(999.5, 799.5).is_none());
     }
 
     #[test]
-    fn pincushion_leaves_pixels_without_a_source_and_barrel_does_not() {
+    fn pincushion_leaves_pixels_without_source_but_barrel_does_not() {
         let corner = |k| {
             camera(CameraModel::SimpleRadial, &[900.0, 500.0, 400.0, k])
                 .undistortion()

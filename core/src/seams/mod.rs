@@ -1,26 +1,26 @@
-//! Seams: whether a model shows where its scene was cut.
+//! Seams: whether the borders of partitions are visible in a model.
 //!
-//! Partitions are trained apart, so a merged model can be worse along the borders of their cells, and its
-//! surface can have a step there. Both are measured on held-out views, by where on the x-z plane of the
-//! aligned frame the surface of each pixel lies:
+//! Partitions are trained separately, so a merged model can be worse along the borders of their cells, and
+//! its surface can have a step there. Both are measured on held-out views. The position of a pixel's surface
+//! on the x-z plane of the aligned frame decides which zones the pixel belongs to:
 //!
-//! - of the *border*, when that is within the band of a border between two cells, and else of the *interior*;
-//! - of the *flank* of the border, when it is of the interior and within three bands of a border;
-//! - of the *control* and of its flank, when the same holds of a control line, through the middle of a cell;
-//! - of nothing, in open water, under sky and where the mask of the photograph leaves a pixel out.
+//! - the *border*, if the surface is within the band of a border between two cells, otherwise the *interior*;
+//! - the *flank* of the border, if it is in the interior and within three bands of a border;
+//! - the *control* and its flank, if the same holds for a control line through the middle of a cell;
+//! - no zone, in open water, in sky and where the mask of the photograph leaves a pixel out.
 //!
-//! A border shows other things than the interior does, which is no fault of the cut: a wreck in the middle of
-//! a sea floor lies on it, and is harder to learn than sand. What lies right beside it is more of the same,
-//! and outside of what a cut breaks: what the band of a border loses against its flank is the seam
-//! ([`SeamReport::seam_db`]). The same difference along control lines, where nothing was cut, says how much
-//! content alone can make of it. `steps` does the same for the surface, `picture` shows both.
+//! Borders and interior show different content, which the partitioning does not cause: a wreck on a border is
+//! harder to learn than sand. The flank shows the same content as the border, but lies outside the region
+//! that partitioning affects. The loss of the border's band against its flank is therefore the seam
+//! ([`SeamReport::seam_db`]). The same difference along control lines, where nothing was cut, shows the
+//! effect of content alone. `steps` does the same for the surface, `picture` shows both.
 //!
 //! Surfaces are those of the measured model itself: its expected range, range / alpha, where alpha is at
-//! least [`SURFACE_ALPHA`], rendered of [`Gaussians::surfaces`](crate::gaussians::Gaussians::surfaces). Haze
-//! is no part of these, because it would move surfaces towards the camera. The water is not either: it
-//! changes colours, whether it acts on Gaussians or on pixels, and leaves alpha and range as they are.
+//! least [`SURFACE_ALPHA`], rendered from [`Gaussians::surfaces`](crate::gaussians::Gaussians::surfaces).
+//! That excludes haze, which would move surfaces towards the camera. The water plays no part: it changes
+//! colours but not alpha or range, whether it acts on Gaussians or on pixels.
 //!
-//! No GPU here: a caller renders. Sums go in the order of pixels and views, so a number does not depend on
+//! No GPU here: a caller renders. Sums run in the order of pixels and views, so results do not depend on
 //! threads.
 
 mod picture;
@@ -42,26 +42,26 @@ use steps::{StepsOf, steps};
 pub use surfaces::SURFACE_ALPHA;
 use surfaces::{BESIDE, Surfaces, Zones};
 
-/// What `metrics.json` says of these numbers.
+/// The description of these measures in `metrics.json`.
 pub const PROTOCOL: &str = "border: pixels whose surface (expected range of the model without haze, alpha 0.5 and more, not \
-     masked) lies on the horizontal plane within seams.band of a border between cells; interior: surfaces further away; flank: of these, within \
+     masked) lies on the horizontal plane within seams.band of a border between cells; interior: surfaces further away; flank: interior within \
      three bands; control and its flank: the same at lines through the middle of cells, where nothing was cut, within the interior. \
      border_psnr, border_ssim, control_psnr, control_ssim: means over the views whose band and flank each have \
      seams.least_share of the picture; interior_psnr, interior_ssim: the interior in the views of border_psnr; SSIM is the \
      mean of its map. seam_db: mean of flank - border. range_step: median \
      over neighbouring pixels on two sides of a line of |difference| / mean of the depths that lines through 4 pixels \
-     of inverse depth on either side, 2 pixels from the line on, foretell for it; beside: the same 2 bands from the line";
+     of inverse depth on either side, 2 pixels from the line on, predict for it; beside: the same 2 bands from the line";
 
 /// A straight piece of a border on the aligned x-z plane, along one axis.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Line {
-    /// Which coordinate is the same all along.
+    /// The axis whose coordinate is constant along the line.
     pub axis: Axis,
     /// That coordinate, scene units.
     pub at: f64,
-    /// Where it begins on the other axis; minus infinity where cells are open.
+    /// Start on the other axis; minus infinity for unbounded cells.
     pub from: f64,
-    /// Where it ends, above `from`.
+    /// End on the other axis, above `from`.
     pub to: f64,
 }
 
@@ -76,7 +76,7 @@ pub enum Axis {
 }
 
 impl Axis {
-    /// The other one.
+    /// The other horizontal axis.
     pub fn across(self) -> Self {
         match self {
             Self::X => Self::Z,
@@ -94,7 +94,7 @@ impl Axis {
 }
 
 impl Line {
-    /// The coordinate that is the same along the line, and the one along it.
+    /// The coordinates of a point across the line and along it.
     fn split(&self, point: DVec2) -> (f64, f64) {
         match self.axis {
             Axis::X => (point.x, point.y),
@@ -102,18 +102,19 @@ impl Line {
         }
     }
 
-    /// Distance to a point (x, z), scene units; NaN of NaN.
+    /// Distance to a point (x, z), scene units; NaN for NaN.
     pub fn distance(&self, point: DVec2) -> f64 {
         let (across, along) = self.split(point);
         (across - self.at).hypot((self.from - along).max(along - self.to).max(0.0))
     }
 
-    /// Whether a point lies beyond the line; one on it lies on the lower side, as cells are (lo, hi].
+    /// Whether a point lies beyond the line. A point on the line belongs to the lower side, because cells are
+    /// (lo, hi].
     pub fn is_beyond(&self, point: DVec2) -> bool {
         self.split(point).0 > self.at
     }
 
-    /// Whether the straight way between two finite points leads over the line.
+    /// Whether the segment between two finite points crosses the line.
     pub fn is_crossed(&self, a: DVec2, b: DVec2) -> bool {
         if self.is_beyond(a) == self.is_beyond(b) {
             return false;
@@ -124,7 +125,7 @@ impl Line {
     }
 }
 
-/// Where a scene was cut.
+/// The borders of a scene's partitions.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SeamLines {
     /// From world axes to the aligned frame.
@@ -133,11 +134,11 @@ pub struct SeamLines {
     pub borders: Vec<Line>,
     /// Lines through the middle of cells; may be none.
     pub controls: Vec<Line>,
-    /// How far bands reach on either side, scene units.
+    /// Width of a band on either side, scene units.
     pub band: f64,
 }
 
-/// A held-out view of the model: what it looks like is in pictures, this is where.
+/// The geometry of a rendered held-out view.
 #[derive(Clone, Copy, Debug)]
 pub struct SeenView<'a> {
     /// Its camera, of the size of the pictures.
@@ -160,11 +161,11 @@ pub struct SeamMeter {
     control_steps: [Vec<f32>; 2],
 }
 
-/// What of a view is where, for a picture of it.
+/// The zones of a view, to draw a picture of them.
 pub struct ViewZones {
     width: usize,
     zones: Vec<Zones>,
-    /// Pixels beside which the surface passes over a border, and over a control line.
+    /// Pixels beside which the surface crosses a border, and a control line.
     on_border: Vec<usize>,
     on_control: Vec<usize>,
     /// Whether the view counts in the means of the border.
@@ -179,14 +180,14 @@ impl ViewZones {
 }
 
 impl SeamMeter {
-    /// Nothing measured yet.
+    /// A meter without measurements.
     pub fn new(lines: SeamLines, config: SeamsConfig) -> Self {
         let (border_steps, control_steps) = Default::default();
         Self { lines, config, views: Vec::new(), border_steps, control_steps }
     }
 
     /// Measures `render` against `truth`, whose mask counts. All pictures have the size of the camera; `ssim`
-    /// is the map of the two, `None` where the mask leaves nothing.
+    /// is the map of the two, `None` if the mask leaves nothing.
     pub fn add(
         &mut self,
         view: &SeenView<'_>,
@@ -214,7 +215,7 @@ impl SeamMeter {
         ViewZones { width: surfaces.width, zones, on_border, on_control, counts }
     }
 
-    /// Everything that was measured.
+    /// The results.
     pub fn report(self) -> SeamReport {
         SeamReport::of(self.lines.band, &self.views, self.border_steps, self.control_steps)
     }

@@ -1,18 +1,17 @@
-//! A picture of what was measured where: the render with the lines on it, and beside it the differences by
-//! zone.
+//! Draws a measurement: the render with the lines on it, and beside it the differences by zone.
 
 use super::{ViewZones, Zones};
 use crate::Result;
 use crate::picture::encode_png;
 use crate::views::PackedImage;
 
-/// Differences are shown so many times larger, as beside photograph and render.
+/// Factor by which differences are amplified, as in the comparison of photograph and render.
 const GAIN: u8 = 4;
 /// Borders, on the render.
 const BORDER: [u8; 3] = [255, 214, 0];
 /// Control lines, on the render.
 const CONTROL: [u8; 3] = [0, 210, 255];
-/// A zone without differences, and one where they are largest.
+/// Shades of a zone for no difference and for the largest.
 const BORDER_SHADES: [[u8; 3]; 2] = [[74, 40, 0], [255, 214, 120]];
 const CONTROL_SHADES: [[u8; 3]; 2] = [[0, 44, 66], [130, 235, 255]];
 const INTERIOR_SHADES: [[u8; 3]; 2] = [[0, 0, 0], [255, 255, 255]];
@@ -20,15 +19,16 @@ const INTERIOR_SHADES: [[u8; 3]; 2] = [[0, 0, 0], [255, 255, 255]];
 const NOTHING: [u8; 3] = [56, 56, 64];
 
 impl ViewZones {
-    /// Two panels from left to right, PNG. The render: borders between cells yellow, control lines blue. Four
-    /// times the largest difference of a pixel's channels: bright is wrong; yellow in the band of a border,
-    /// blue in that of a control line, grey elsewhere; flat grey is not measured.
+    /// Two panels from left to right, PNG. Left: the render with borders between cells in yellow and control
+    /// lines in blue. Right: four times the largest difference among a pixel's channels, where bright means
+    /// wrong. It is yellow in the band of a border, blue in that of a control line and grey elsewhere; flat
+    /// grey is not measured.
     ///
     /// # Errors
-    /// When the picture is of another size than what was measured.
+    /// When the picture has another size than the measured one.
     pub fn picture(&self, render: &PackedImage, truth: &PackedImage) -> Result<Vec<u8>> {
         let mut lined: Vec<[u8; 3]> = render.pixels.iter().map(|pixel| rgb(*pixel)).collect();
-        // Two pixels wide, or a line is lost in a large picture.
+        // Two pixels wide, because thinner lines are hard to see in a large picture.
         let mut draw = |on: &[usize], colour: [u8; 3]| {
             for &index in on {
                 for near in [index, index + 1, index + self.width] {

@@ -1,4 +1,5 @@
-//! The numbers: sums over zones of a view, means over views, and what of them the cut is to blame for.
+//! The report: sums over the zones of a view, means over views, and the share of the loss that partitioning
+//! causes.
 
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
@@ -10,11 +11,10 @@ use crate::views::PackedImage;
 /// Fewer steps than this have no median.
 const LEAST_STEPS: usize = 30;
 
-/// Everything that was measured at the borders of a model's cells. PSNR in dB; `None` where nothing can be
-/// said.
+/// The results at the borders of a model's cells. PSNR in dB; `None` if there is too little to measure.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct SeamReport {
-    /// How far bands reach on either side of a line, scene units.
+    /// Width of a band on either side of a line, scene units.
     pub band: f64,
     /// The bands of borders.
     pub border: BandReport,
@@ -22,23 +22,22 @@ pub struct SeamReport {
     pub control: BandReport,
     /// Surfaces outside the bands of borders.
     pub interior: InteriorReport,
-    /// What the bands of borders lose against their flanks: `loss_db` of the border.
+    /// Loss of the bands of borders against their flanks: `loss_db` of the border.
     pub seam_db: Option<f64>,
     /// Its standard error.
     pub seam_db_error: Option<f64>,
-    /// By how much the SSIM of the bands of borders is below that of their flanks.
+    /// SSIM of the flanks of borders minus that of their bands.
     pub seam_ssim: Option<f64>,
-    /// How far the surface steps across lines.
+    /// Steps of the surface across lines.
     pub range_step: RangeSteps,
     /// Each view, in the order of measuring.
     pub views: Vec<ViewSeams>,
 }
 
-/// Along one kind of lines.
+/// Results along one kind of lines.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct BandReport {
-    /// Views that count: whose band and flank have each the least share of the picture, and some error in
-    /// both.
+    /// Views that count: band and flank each have at least the least share of the picture, and some error.
     pub views: u32,
     /// Mean over these.
     pub psnr: Option<f64>,
@@ -48,9 +47,9 @@ pub struct BandReport {
     pub flank_psnr: Option<f64>,
     /// Mean of the flank over these.
     pub flank_ssim: Option<f64>,
-    /// By how much the band is below its flank, mean over these; above 0 is a loss.
+    /// PSNR of the flank minus that of the band, mean over these; above 0 is a loss.
     pub loss_db: Option<f64>,
-    /// Its standard error by how much views differ; `None` below two of them.
+    /// Its standard error, estimated from the differences between views; `None` below two views.
     pub loss_db_error: Option<f64>,
     /// Mean of the interior over these: the same photographs.
     pub interior_psnr: Option<f64>,
@@ -75,8 +74,8 @@ pub struct InteriorReport {
     pub pooled_ssim: Option<f64>,
 }
 
-/// Steps of the surface across lines. Where the ratio of borders is above that of control lines, the cut has
-/// left steps.
+/// Steps of the surface across lines. If the ratio of borders is above that of control lines, partitioning
+/// has left steps.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct RangeSteps {
     /// Across borders.
@@ -90,7 +89,7 @@ pub struct RangeSteps {
 pub struct Steps {
     /// Pairs of pixels.
     pub pairs: u64,
-    /// Median step, a share of the depth; `None` below 30 pairs.
+    /// Median step, as a share of the depth; `None` below 30 pairs.
     pub median: Option<f64>,
     /// Pairs across the same lines moved by two bands to either side.
     pub beside_pairs: u64,
@@ -105,7 +104,7 @@ pub struct Steps {
 pub struct ViewSeams {
     /// Pixels in the band of borders.
     pub border_pixels: u64,
-    /// Of them; `None` also where there is no error at all.
+    /// Of them; `None` also if there is no error at all.
     pub border_psnr: Option<f64>,
     /// Of them.
     pub border_ssim: Option<f64>,
@@ -155,7 +154,7 @@ pub struct Sums {
     control: Sum,
     control_flank: Sum,
     interior: Sum,
-    /// Pixels below which a zone says nothing.
+    /// Least pixels of a zone that counts.
     least: f64,
 }
 
@@ -190,7 +189,7 @@ impl Sums {
         sums
     }
 
-    /// PSNR and SSIM of a zone that is large enough.
+    /// PSNR and SSIM of a zone; `None` if it is too small.
     fn of_zone(&self, sum: &Sum) -> (Option<f64>, Option<f64>) {
         let is_enough = sum.pixels as f64 >= self.least;
         (sum.psnr().filter(|_| is_enough), sum.mean_ssim().filter(|_| is_enough))
@@ -201,7 +200,8 @@ impl Sums {
         self.beside([&self.border, &self.border_flank]).is_some()
     }
 
-    /// (PSNR, SSIM) of a band, of its flank and of the interior, where all are large enough and have errors.
+    /// (PSNR, SSIM) of a band, of its flank and of the interior; `None` unless all are large enough and have
+    /// errors.
     fn beside(&self, [band, flank]: [&Sum; 2]) -> Option<[(f64, f64); 3]> {
         let both = |sum| {
             let (psnr, ssim) = self.of_zone(sum);
@@ -256,7 +256,7 @@ impl SeamReport {
 }
 
 impl BandReport {
-    /// Over the band and the flank that `zones` gives of a view.
+    /// Over the band and the flank that `zones` selects in a view.
     fn of(views: &[Sums], zones: impl Fn(&Sums) -> [&Sum; 2]) -> Self {
         let counted: Vec<[(f64, f64); 3]> =
             views.iter().filter_map(|view| view.beside(zones(view))).collect();
@@ -295,8 +295,8 @@ fn median(mut steps: Vec<f32>) -> Option<f64> {
     is_enough.then(|| f64::from(*steps.select_nth_unstable_by(middle, f32::total_cmp).1))
 }
 
-/// Puts a report into a `metrics.json` whose `views` are those that were measured; nulls where there is none,
-/// because nothing was cut.
+/// Puts a report into a `metrics.json` whose `views` are those that were measured; nulls without a report,
+/// for a scene with a single partition.
 pub fn put_into(metrics: &mut Value, report: Option<&SeamReport>) {
     metrics["border_psnr"] = json!(report.and_then(|report| report.border.psnr));
     metrics["border_ssim"] = json!(report.and_then(|report| report.border.ssim));
@@ -325,7 +325,7 @@ fn mean(values: &[f64]) -> Option<f64> {
     finite(values.iter().sum::<f64>() / values.len() as f64)
 }
 
-/// Of independent values, of which there are at least two.
+/// For independent values; `None` below two.
 fn variance_of_mean(values: &[f64]) -> Option<f64> {
     let mean = mean(values).filter(|_| values.len() > 1)?;
     let count = values.len() as f64;

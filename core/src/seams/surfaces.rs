@@ -1,4 +1,4 @@
-//! Where on the plane the surface of each pixel lies, and of which zone that makes the pixel.
+//! The position of each pixel's surface on the plane, and the zones that follow from it.
 
 use glam::{DQuat, DVec2};
 use rayon::prelude::*;
@@ -6,34 +6,34 @@ use rayon::prelude::*;
 use super::{Line, SeamLines, SeenView};
 use crate::views::PackedImage;
 
-/// Below this alpha there is no surface at a pixel.
+/// Pixels with less alpha have no surface.
 pub const SURFACE_ALPHA: f32 = 0.5;
 
-/// Flanks reach so many bands from a line: of a straight one, they have twice the area of its band.
+/// Distance in bands that a flank reaches from a line. Along a straight line it has twice the area of the
+/// band.
 const FLANK: f64 = 3.0;
 /// The middle of a flank, in bands.
 pub const BESIDE: f64 = 2.0;
 
-/// What a pixel counts for: any of the sets below, or nothing where it shows no surface or the mask leaves it
-/// out.
+/// The zones of a pixel: any of the sets below, or none if it shows no surface or the mask leaves it out.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Zones(u8);
 
 impl Zones {
-    /// It shows no surface, or the mask leaves it out.
+    /// The pixel shows no surface, or the mask leaves it out.
     pub const NOTHING: Self = Self(0);
-    /// Within the band of a border; of nothing else then.
+    /// Within the band of a border; excludes all other zones.
     pub const BORDER: Self = Self(1);
-    /// Outside of it.
+    /// Outside the bands of all borders.
     pub const INTERIOR: Self = Self(2);
-    /// Of the interior, up to three bands from a border.
+    /// In the interior, up to three bands from a border.
     pub const BORDER_FLANK: Self = Self(4);
-    /// Of the interior, within the band of a control line.
+    /// In the interior, within the band of a control line.
     pub const CONTROL: Self = Self(8);
-    /// Of the interior, from there up to three bands from a control line.
+    /// In the interior, outside that band and up to three bands from a control line.
     pub const CONTROL_FLANK: Self = Self(16);
 
-    /// Whether it is of the set `one`.
+    /// Whether the pixel is in the zone `one`.
     pub fn are(self, one: Self) -> bool {
         self.0 & one.0 != 0
     }
@@ -43,18 +43,17 @@ impl Zones {
     }
 }
 
-/// The surfaces of a view, `[H*W]`; NaN where there is none.
+/// The surfaces of a view, `[H*W]`; NaN for pixels without one.
 pub struct Surfaces {
     pub width: usize,
     /// Aligned x and z.
     pub plane: Vec<DVec2>,
-    /// 1 / depth along the camera's axis, 1/scene unit: over the pixels of a plane, however it slopes, a
-    /// linear function.
+    /// 1 / depth along the camera's axis, 1/scene unit; linear over the pixels of any plane.
     pub inverse_depth: Vec<f64>,
 }
 
 impl Surfaces {
-    /// Those of the pixels that `truth`'s mask counts.
+    /// The surfaces of the pixels that `truth`'s mask counts.
     pub fn of(view: &SeenView<'_>, truth: &PackedImage, world_to_aligned: DQuat) -> Self {
         let (camera, width) = (view.camera, view.camera.width as usize);
         let to_aligned = world_to_aligned * view.pose.rotation.inverse();
@@ -97,7 +96,8 @@ impl Surfaces {
         self.plane.par_iter().map(zones).collect()
     }
 
-    /// The lines that any surface can be within `band` of: a view sees few of the hundreds of a large plan.
+    /// The lines that can be within `band` of a surface. A view sees only few of the hundreds in a large
+    /// plan.
     pub fn near(&self, lines: &[Line], band: f64) -> Vec<Line> {
         let seen = self.plane.iter().filter(|point| point.is_finite());
         let (low, high) =

@@ -1,4 +1,4 @@
-//! Defects of known size on surfaces of known shape: what was put in must come out, and nothing else.
+//! Defects of known size on surfaces of known shape: exactly these must be measured.
 
 use glam::DVec3;
 use serde_json::{Value, json};
@@ -15,7 +15,7 @@ fn at_x(at: f64) -> Line {
     Line { axis: Axis::X, at, from: f64::NEG_INFINITY, to: f64::INFINITY }
 }
 
-/// A border at x = 0 and control lines at x = -3 and 3, of cells that end at -6 and 6.
+/// A border at x = 0 and control lines at x = -3 and 3, for cells that end at -6 and 6.
 fn lines() -> SeamLines {
     SeamLines {
         world_to_aligned: DQuat::IDENTITY,
@@ -25,7 +25,7 @@ fn lines() -> SeamLines {
     }
 }
 
-/// Two half spaces of ground that meet over x = 0: y at x = 0 of either (y points down), and their slopes
+/// Two half planes of ground that meet at x = 0: y of either at x = 0 (y points down), and their slopes
 /// dy/dx.
 #[derive(Clone, Copy)]
 struct Ground {
@@ -59,7 +59,7 @@ impl Shot {
             let (x, y) = (f64::from(index % WIDTH) + 0.5, f64::from(index / WIDTH) + 0.5);
             let ray = DVec3::new((x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, 1.0).normalize();
             let ray = pose.rotation.inverse() * ray;
-            // y = y0 + slope x along the ray, in the half space where the hit lies.
+            // y = y0 + slope x along the ray, in the half plane of the hit.
             let hit = |side: usize| {
                 let (y0, slope) = (ground.y[side], ground.slope[side]);
                 let t = (y0 + slope * eye.x - eye.y) / (ray.y - slope * ray.x);
@@ -83,10 +83,10 @@ impl Shot {
         SeenView { camera: &self.camera, pose: &self.pose, alpha: &self.alpha, range: &self.range }
     }
 
-    /// x on the ground of a pixel of a shot from above.
+    /// Ground x of a pixel in a shot from above.
     fn x(&self, index: usize) -> f64 {
         let column = (index % WIDTH as usize) as f64 + 0.5;
-        // The picture's y points to +z, so its x points to -x or +x: by the pose.
+        // The picture's y points to +z, so its x points to -x or +x, depending on the pose.
         let right = self.pose.rotation.inverse() * DVec3::X;
         self.pose.centre().x + right.x * (column - self.camera.cx) / self.camera.fx * DISTANCE
     }
@@ -96,7 +96,7 @@ fn texture(index: usize) -> u8 {
     100 + (index * 37 % 41) as u8
 }
 
-/// The photograph, and a render that is off by `error` of each pixel, up and down in turns.
+/// The photograph, and a render that differs from it by `error` at each pixel, with alternating sign.
 fn pictures(error: impl Fn(usize) -> u8) -> (PackedImage, PackedImage) {
     let picture = |value: &dyn Fn(usize) -> u8| {
         let rgb: Vec<u8> = (0..(WIDTH * HEIGHT) as usize).flat_map(|index| [value(index); 3]).collect();
@@ -121,7 +121,7 @@ fn db(error: f64) -> f64 {
     20.0 * (255.0 / error).log10()
 }
 
-/// Means of values that are equal but for the rounding of logarithms.
+/// Compares means of values that are equal except for the rounding of logarithms.
 fn assert_near(found: Option<f64>, expected: f64, what: &str) {
     assert!(found.is_some_and(|found| (found - expected).abs() < 1e-9), "{what}: {found:?}, not {expected}");
 }
@@ -162,8 +162,8 @@ fn no_defect_is_found_where_there_is_none() {
 }
 
 #[test]
-fn what_is_hard_on_both_sides_of_a_border_is_no_seam() {
-    // A wreck that the border leads over, up to where its flanks end.
+fn hard_content_on_both_sides_of_a_border_is_no_seam() {
+    // A wreck on the border, as wide as its flanks.
     let shot = Shot::above(0.0, FLAT);
     let mut meter = meter();
     add(&mut meter, &shot, |index| if shot.x(index).abs() <= 3.0 * BAND { 8 } else { 2 });
@@ -176,7 +176,7 @@ fn what_is_hard_on_both_sides_of_a_border_is_no_seam() {
 
 #[test]
 fn views_that_are_worse_all_over_do_not_look_like_a_seam() {
-    // The border is seen by a bad photograph, the control line by a good one: nothing that a cut has done.
+    // A bad photograph shows the border and a good one the control line, which is not caused by partitioning.
     let mut meter = meter();
     add(&mut meter, &Shot::above(-7.5, FLAT), |_| 1);
     add(&mut meter, &Shot::above(0.0, Ground { y: [4.0; 2], ..FLAT }), |_| 9);
@@ -185,7 +185,7 @@ fn views_that_are_worse_all_over_do_not_look_like_a_seam() {
     assert_near(report.border.psnr, db(9.0), "border");
     assert_near(report.control.psnr, db(1.0), "control");
     assert_near(report.seam_db, 0.0, "seam");
-    assert_eq!(report.seam_db_error, None, "one view says nothing of its error");
+    assert_eq!(report.seam_db_error, None, "one view gives no standard error");
 }
 
 #[test]
@@ -211,9 +211,8 @@ fn a_pixel_belongs_to_the_border_by_where_its_surface_lies() {
 }
 
 #[test]
-fn lines_stand_in_the_aligned_frame_and_end_where_cells_end() {
-    // A quarter turn about y takes world z to aligned x: the border runs along world x, for aligned z up
-    // to 1.
+fn lines_are_in_the_aligned_frame_and_end_with_their_cells() {
+    // A quarter turn about y maps world z to aligned x: the border runs along world x, for aligned z up to 1.
     let half = std::f64::consts::FRAC_1_SQRT_2;
     let lines = SeamLines {
         world_to_aligned: DQuat::from_xyzw(0.0, half, 0.0, half),
@@ -228,7 +227,7 @@ fn lines_stand_in_the_aligned_frame_and_end_where_cells_end() {
         let down = (index / WIDTH as usize) as f64 + 0.5;
         let down_axis = shot.pose.rotation.inverse() * DVec3::Y;
         let z = down_axis.z * (down - shot.camera.cy) / shot.camera.fy * DISTANCE;
-        // Aligned z is world -x; beyond the end of the line its distance is that to the end.
+        // Aligned z is world -x. Beyond the end of the line, the distance is that to the end.
         let past = (-shot.x(index) - 1.0).max(0.0);
         let expected = z.hypot(past) <= BAND;
         assert_eq!(
@@ -241,7 +240,7 @@ fn lines_stand_in_the_aligned_frame_and_end_where_cells_end() {
 }
 
 #[test]
-fn masks_and_open_water_are_of_no_zone() {
+fn masked_pixels_and_open_water_belong_to_no_zone() {
     let mut shot = Shot::above(0.0, FLAT);
     let open = |index: usize| index / WIDTH as usize >= 40;
     for index in (0..shot.alpha.len()).filter(|&index| open(index)) {
@@ -249,7 +248,7 @@ fn masks_and_open_water_are_of_no_zone() {
         shot.range[index] = 0.4 * 10.0;
     }
     let masked = |index: usize| index / (WIDTH as usize) < 10;
-    // What is open or masked is as wrong as can be.
+    // Open and masked pixels have the largest possible error.
     let (render, mut truth) = pictures(|index| if open(index) || masked(index) { 90 } else { 2 });
     for (index, pixel) in truth.pixels.iter_mut().enumerate() {
         if masked(index) {
@@ -285,10 +284,10 @@ fn views_that_see_no_border_or_hardly_any_do_not_count() {
     let seen = report.views[2].border_pixels;
     assert!(seen > 0 && seen < u64::from(WIDTH * HEIGHT) / 20, "{seen}");
     assert_eq!((report.views[1].border_psnr, report.views[2].border_psnr), (None, None));
-    assert!(report.border.pooled_psnr.unwrap() < db(5.0), "all pixels count in what is pooled");
+    assert!(report.border.pooled_psnr.unwrap() < db(5.0), "all pixels count in the pooled value");
 }
 
-/// The report of the same ground from straight above and from aside.
+/// The report of the same ground seen from straight above and from the side.
 fn steps_of(ground: Ground) -> SeamReport {
     let mut meter = meter();
     add(&mut meter, &Shot::above(0.4, ground), |_| 1);
@@ -303,11 +302,11 @@ fn a_step_of_the_surface_at_a_border_is_found_at_its_height() {
     for height in [0.02, 0.1, 0.3] {
         let report = steps_of(Ground { y: [DISTANCE, DISTANCE + height], ..FLAT });
         let found = report.range_step.border.median.unwrap();
-        // Depths are along the camera's axis: those of the camera aside differ a little from those of the
+        // Depths are along the camera's axis, so those of the camera at the side differ a little from the
         // others.
         let expected = height / (DISTANCE + height / 2.0);
         assert!((found / expected - 1.0).abs() < 0.05, "{found}, not {expected}");
-        // f32 ranges have 7 digits, and what is foretold amplifies their rounding.
+        // f32 ranges have 7 digits, and extrapolation amplifies their rounding.
         assert!(report.range_step.control.median.unwrap() < 2e-6, "{report:?}");
         assert!(report.range_step.border.beside_median.unwrap() < 2e-6, "{report:?}");
         assert!(report.range_step.border.ratio.unwrap() > 1e3, "{report:?}");
@@ -322,13 +321,13 @@ fn slopes_are_no_steps() {
         let median = report.range_step.border.median.unwrap();
         assert!(median < 2e-6, "slope {slope}: {median}");
     }
-    // Nor is an edge, where two slopes meet at the same height.
+    // An edge where two slopes meet at the same height is no step either.
     let report = steps_of(Ground { slope: [0.3, -0.2], ..FLAT });
     assert!(report.range_step.border.median.unwrap() < 0.01, "{report:?}");
 }
 
 #[test]
-fn steps_elsewhere_are_none_of_a_border() {
+fn steps_elsewhere_do_not_count_for_a_border() {
     // The ground breaks at x = 0, and the border runs at x = 2.
     let lines = SeamLines { borders: vec![at_x(2.0)], controls: vec![at_x(0.0)], ..lines() };
     let mut meter = SeamMeter::new(lines, SeamsConfig::default());
@@ -340,7 +339,7 @@ fn steps_elsewhere_are_none_of_a_border() {
 }
 
 #[test]
-fn a_line_is_crossed_between_its_ends_and_belongs_to_its_lower_side() {
+fn a_line_is_crossed_between_its_ends_only() {
     let line = Line { axis: Axis::Z, at: 1.0, from: 0.0, to: 2.0 };
     let crosses = |a: (f64, f64), b: (f64, f64)| line.is_crossed(a.into(), b.into());
     assert!(crosses((1.0, 0.5), (1.0, 1.5)) && crosses((1.0, 1.5), (1.0, 0.5)));
@@ -360,7 +359,7 @@ fn a_report_goes_into_the_metrics_and_into_each_view() {
     add(&mut meter, &Shot::above(0.0, FLAT), |_| 5);
     let report = meter.report();
     let again: SeamReport = serde_json::from_str(&serde_json::to_string(&report).unwrap()).unwrap();
-    assert_eq!(again, report, "it travels as JSON");
+    assert_eq!(again, report, "it survives JSON");
 
     let views = || json!([{ "name": "a", "psnr": 1.0 }, { "name": "b", "psnr": 2.0 }]);
     let mut metrics = json!({ "views": views() });
@@ -368,7 +367,7 @@ fn a_report_goes_into_the_metrics_and_into_each_view() {
     assert_eq!(metrics["border_psnr"], json!(report.border.psnr));
     assert_eq!(metrics["interior_ssim"], json!(report.border.interior_ssim));
     assert_eq!(metrics["seams"]["control"]["views"], 1);
-    assert_eq!(metrics["seams"].get("views"), None, "they stand with the views");
+    assert_eq!(metrics["seams"].get("views"), None, "they are with the views");
     assert_eq!(metrics["views"][0]["border_psnr"], Value::Null);
     assert_eq!(
         (&metrics["views"][1]["name"], metrics["views"][1]["border_psnr"].is_number()),

@@ -1,4 +1,4 @@
-//! The files of a synthetic scene: a COLMAP binary model, and NumPy archives for depth.
+//! Writes the files of a synthetic scene: a COLMAP binary model and a NumPy archive for depth.
 
 use std::path::Path;
 
@@ -8,7 +8,7 @@ use crate::{CoreError, Result};
 
 use super::points::SparsePoint;
 
-/// Little-endian bytes in the making.
+/// Builds little-endian bytes.
 #[derive(Default)]
 struct Bytes(Vec<u8>);
 
@@ -55,7 +55,7 @@ pub(super) fn write_colmap(
     cloud.u64(points.len() as u64);
     for (id, point) in (1_u64..).zip(points) {
         cloud.u64(id).f64s(&point.position.to_array()).u8s(&point.colour);
-        // The mean reprojection error that the points' noise amounts to, pixels.
+        // The mean reprojection error that follows from the points' noise, pixels.
         cloud.f64s(&[super::points::ERROR_PX]).u64(point.track.len() as u64);
         for &(view, pixel) in &point.track {
             let observations = &mut seen[view as usize];
@@ -80,14 +80,15 @@ pub(super) fn write_colmap(
 
 /// Writes an `.npz`: a ZIP archive of stored `.npy` members, each an f32 array [height, width].
 ///
-/// `numpy.load(path)[name]` reads it; members are as [`encode_npy`] writes them.
+/// `numpy.load(path)[name]` reads a member, which is written by [`encode_npy`].
 pub(super) fn write_npz(path: &Path, width: u32, height: u32, members: &[(String, Vec<f32>)]) -> Result<()> {
     let (mut archive, mut directory) = (Bytes::default(), Bytes::default());
     for (name, values) in members {
         let npy = encode_npy(width, height, values);
         let file = format!("{name}.npy");
         let size = npy.len() as u32;
-        // Version 2.0, no flags, stored, 1 January 1980: the same bytes whenever it is written.
+        // Version 2.0, no flags, stored, 1 January 1980, so that the bytes do not depend on the time of
+        // writing.
         let mut common = Bytes::default();
         common.u16(20).u16(0).u16(0).u16(0).u16(0x21).u32(crc32(&npy)).u32(size).u32(size);
         common.u16(file.len() as u16).u16(0);

@@ -1,5 +1,5 @@
-//! Rays against parts: boxes, cylinders, ellipsoids and torn shells, each in a frame of its own, found
-//! through a small tree of bounding boxes; and the sea floor as a height field.
+//! Intersects rays with parts: boxes, cylinders, ellipsoids and torn shells, each in its own frame. A small
+//! tree of bounding boxes finds them. The sea floor is a height field.
 
 use glam::{DMat3, DVec3};
 
@@ -12,7 +12,7 @@ pub(super) struct Ray {
     pub direction: DVec3,
 }
 
-/// What a part is made of and looks like.
+/// Material of a part, which decides its appearance.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Material {
     Sand,
@@ -21,16 +21,16 @@ pub(super) enum Material {
     Timber,
     Planks,
     Painted,
-    /// Looks much as open water does.
+    /// Looks similar to open water.
     Dark,
-    /// One colour everywhere: pale paint, paint the colour of water, raked sand.
+    /// Constant colour: pale paint, paint in the colour of water, raked sand.
     SmoothPale,
     SmoothBlue,
     SmoothSand,
 }
 
 impl Material {
-    /// Whether it has the same colour everywhere: nothing on it can be found again.
+    /// Whether its colour is constant, so that no features can be matched on it.
     pub fn is_smooth(self) -> bool {
         matches!(self, Self::SmoothPale | Self::SmoothBlue | Self::SmoothSand)
     }
@@ -62,7 +62,7 @@ pub(super) enum Shape {
     Capsule(f64, f64),
     /// Radii.
     Ellipsoid(DVec3),
-    /// Radii of an ellipsoid of which the lower half (y > 0) stands as a thin sheet, with tears.
+    /// Radii of an ellipsoid whose lower half (y > 0) is a thin sheet with tears.
     TornHull(DVec3),
 }
 
@@ -78,7 +78,7 @@ pub(super) struct Part {
     pub seed: u32,
 }
 
-/// Where a ray ends.
+/// The end of a ray on a surface.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Hit {
     /// Distance along the ray.
@@ -91,7 +91,7 @@ pub(super) struct Hit {
     pub seed: u32,
 }
 
-/// Distances nearer than this are the surface that a ray starts from.
+/// Smaller distances are hits on the surface from which the ray starts.
 const SELF_DISTANCE: f64 = 1e-4;
 
 impl Part {
@@ -234,8 +234,8 @@ fn hit_ellipsoid(
     Some((range, (o + d * range) / (radii * radii)))
 }
 
-/// The sea floor: y (down) as a function of x and z on a grid, bilinear between; beyond its rim it is level,
-/// or there is none.
+/// The sea floor: y (down) as a function of x and z, bilinear on a grid. Beyond its rim it continues level or
+/// ends.
 pub(super) struct SeaFloor {
     origin: [f64; 2],
     size: [usize; 2],
@@ -244,7 +244,7 @@ pub(super) struct SeaFloor {
     slab: [f64; 2],
     /// Whether there is no floor beyond the rim.
     ends: bool,
-    /// Where the sand is smooth.
+    /// Areas of smooth sand.
     smooth: Vec<Patch>,
 }
 
@@ -272,7 +272,7 @@ impl SeaFloor {
         }
     }
 
-    /// The same without anything beyond the rim, and with smooth sand in places.
+    /// The same floor, ending at the rim and with patches of smooth sand.
     #[must_use]
     pub fn ending(self, smooth: Vec<Patch>) -> Self {
         Self { ends: true, smooth, ..self }
@@ -323,7 +323,7 @@ impl SeaFloor {
         if height < 0.0 {
             return None;
         }
-        // With slopes below 1, the ray cannot meet the floor before it has come down this far.
+        // With slopes below 1, the height above the floor falls at most this fast along the ray.
         let approach = (d.y + d.x.hypot(d.z)).max(0.05);
         let mut next = t;
         while next < leave {
@@ -411,7 +411,7 @@ impl World {
         self.floor.hit(ray, nearest).or(best)
     }
 
-    /// Whether nothing stands between a point and another one.
+    /// Whether nothing occludes the line between two points.
     pub fn sees(&self, from: DVec3, to: DVec3) -> bool {
         let way = to - from;
         let length = way.length();

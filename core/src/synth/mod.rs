@@ -1,25 +1,32 @@
-//! A small underwater scene with exact truth, made from nothing: a procedural wreck on a sea floor,
-//! ray-cast, put under water, photographed with a noisy sensor, and written as a COLMAP data set.
+//! Generates small underwater scenes with exact ground truth. A procedural wreck on a sea floor is ray-cast
+//! under water with a noisy sensor and written as a COLMAP data set.
 //!
 //! Image formation per channel, linear light (Akkaynak & Treibitz, CVPR 2018):
 //! `I = J exp(-beta_d r) + b_inf (1 - exp(-beta_b r))`, with r the distance along the ray in metres. `b_inf`
-//! may change with the direction of the ray ([`ByDirection`]), before surfaces as in open water.
+//! may change with the direction of the ray ([`ByDirection`]), both in front of surfaces and in open water.
 //!
 //! There are two looks. [`Look::Down`] surveys the wreck from above; no photograph shows open water.
-//! [`Look::Forward`] dives along it with the camera near the horizon, on a reef that ends: much of many
-//! photographs is open water.
+//! [`Look::Forward`] dives along it with the camera near the horizon, on a bounded reef: many photographs
+//! show much open water.
 //!
-//! Layout of the folder: `images/vNNNN.png`, `sparse/0/*.bin`, and `truth/`: `water.json`,
-//! `clear/vNNNN.png` (J of the held-out views, 8-bit sRGB), `valid/vNNNN.png` (white where a ray met a
-//! surface), `depth_m.npz` (z-depth of the pixel centres in metres, f32, 0 = nothing, one array a
-//! held-out view). Every pixel is a pure function of the options: the same bytes on any number of threads.
+//! The folder holds `images/vNNNN.png`, `sparse/0/*.bin` and `truth/` with the ground truth:
+//! - `water.json`;
+//! - `clear/vNNNN.png`: J of the held-out views, 8-bit sRGB;
+//! - `valid/vNNNN.png`: white where all rays of the pixel meet a surface;
+//! - `depth_m.npz`: z-depth of the pixel centres in metres, f32, 0 = nothing, one array for each held-out
+//!   view.
 //!
-//! The forward look adds, of the held-out views, `truth/alpha/vNNNN.png` (8-bit grey: the share of the
-//! pixel's rays that meet a surface, 255 all, 0 none, which is open water) and `truth/kind/vNNNN.png` (8-bit
-//! grey: 0 where no ray meets a surface, 2 where all meet a dark bluish one, whose J is near the colour of
-//! open water, 3 where all meet one whose J is the same everywhere, 1 otherwise). `truth/water.json` has
-//! `by_direction` where the colour of open water changes, with the fields of [`ByDirection`]. Far sand has
-//! finer features than a pixel, which nine rays a pixel do not average out.
+//! Every pixel is a pure function of the options, so the bytes do not depend on the number of threads.
+//!
+//! The forward look adds two maps of the held-out views, 8-bit grey:
+//! - `truth/alpha/vNNNN.png`: share of the pixel's rays that meet a surface, 255 for all, 0 for none, which
+//!   is open water;
+//! - `truth/kind/vNNNN.png`: kind of surface that the rays meet. 0 means none; 2 that all meet a dark bluish
+//!   one, with J close to the colour of open water. 3 means that all meet one with constant J, and 1 anything
+//!   else.
+//!
+//! `truth/water.json` has `by_direction`, with the fields of [`ByDirection`], if the colour of open water
+//! changes. Distant sand has features finer than a pixel, which nine rays a pixel do not average out.
 
 mod files;
 mod geometry;
@@ -44,26 +51,26 @@ use crate::water::{ByDirection, Water};
 use crate::{CoreError, Result};
 use geometry::{Material, Ray, World};
 
-/// Every n-th view gets truth: the views that training holds out by default.
+/// Every n-th view has ground truth: these are the views that training holds out by default.
 const TRUTH_EVERY: usize = 8;
 /// Sensor noise: standard deviation is this times the square root of the signal, linear light.
 const NOISE: f64 = 0.004;
-/// No ray goes further, metres.
+/// Largest range of a ray, metres.
 const FARTHEST: f64 = 80.0;
 
-/// Whereto the cameras look.
+/// The direction in which the cameras look.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Look {
-    /// On the wreck, from above.
+    /// Down on the wreck.
     #[default]
     Down,
-    /// Ahead, a little below the horizon, with open water above it.
+    /// Ahead, slightly below the horizon, with open water above it.
     Forward,
 }
 
 impl Look {
-    /// Rays per pixel and axis: more where surfaces are far and seen at a grazing angle.
+    /// Rays per pixel and axis: more for distant surfaces at grazing angles.
     fn supersample(self) -> u32 {
         match self {
             Self::Down => 2,
@@ -86,21 +93,21 @@ impl Look {
     }
 }
 
-/// Open water that is brighter towards the surface, where red comes from most, and towards a sun along x.
-/// Axes are those of the scene, whose y points down. Over the directions in which the forward look sees open
-/// water, colours change by a factor of about 2.
+/// Open water that is brighter towards the surface, most of all in red, and towards a sun along x. Axes are
+/// those of the scene, whose y points down. Over the directions in which the forward look sees open water,
+/// colours change by a factor of about 2.
 pub const BRIGHTER_UPWARDS: ByDirection = ByDirection {
     middle: [0.0, 0.0, 1.0],
     slopes: [[0.12, -1.35, 0.0], [0.10, -1.15, 0.0], [0.08, -0.90, 0.0]],
     most: 1.0,
 };
 
-/// What to make.
+/// Options of a synthetic scene.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SynthOptions {
-    /// Whereto the cameras look.
+    /// The direction in which the cameras look.
     pub look: Look,
-    /// Seed of the textures, of what lies about, of the dive and of the noise.
+    /// Seed of the textures, of scattered objects, of the dive and of the noise.
     pub seed: u32,
     /// Number of photographs.
     pub views: u32,
@@ -108,10 +115,9 @@ pub struct SynthOptions {
     pub width: u32,
     /// Rows of a photograph.
     pub height: u32,
-    /// What is between camera and wreck; a scene unit is a metre.
+    /// The water between camera and wreck; a scene unit is a metre.
     pub water: Water,
-    /// How the colour of open water changes with direction, scene axes; `None` where it is the same in all
-    /// directions.
+    /// How the colour of open water changes with direction, scene axes; `None` if it is constant.
     pub by_direction: Option<ByDirection>,
 }
 
@@ -123,7 +129,7 @@ impl Default for SynthOptions {
 }
 
 impl SynthOptions {
-    /// As many photographs of the same size, looking forward under water that is brighter upwards.
+    /// The default number and size of photographs, looking forward under water that is brighter upwards.
     pub fn forward() -> Self {
         Self { look: Look::Forward, by_direction: Some(BRIGHTER_UPWARDS), ..Self::default() }
     }
@@ -158,21 +164,21 @@ impl SynthOptions {
     }
 }
 
-/// What was made.
+/// Counts of the generated scene.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 pub struct SynthSummary {
     /// Photographs.
     pub views: u32,
-    /// Views with truth.
+    /// Views with ground truth.
     pub truth_views: u32,
     /// Sparse points.
     pub points: u32,
 }
 
-/// Makes a scene in the folder `out`, which must not hold one; `progress(done, all)` counts photographs.
+/// Generates a scene in the folder `out`, which must not hold one; `progress(done, all)` counts photographs.
 ///
 /// # Errors
-/// When the options make no scene, when `out` already holds photographs, or when it cannot be written.
+/// When the options are invalid, when `out` already holds a scene, or when it cannot be written.
 pub fn synthesise(
     out: &Path,
     options: &SynthOptions,
@@ -263,7 +269,7 @@ fn water_json(options: &SynthOptions) -> String {
     format!("{values:#}\n")
 }
 
-/// What the rays of a pixel meet.
+/// Number of a pixel's rays that meet each kind of surface.
 #[derive(Clone, Copy, Default)]
 struct Met {
     surface: u32,
@@ -279,13 +285,13 @@ impl Met {
     }
 }
 
-/// One view: what the sensor gives, and the truth about it.
+/// One view: the output of the sensor and its ground truth.
 struct Photograph {
     pixels: RgbImage,
     clear: RgbImage,
     /// Row by row.
     met: Vec<Met>,
-    /// Rays of a pixel.
+    /// Rays of each pixel.
     rays: u32,
 }
 
@@ -309,7 +315,7 @@ impl Photograph {
                     let offset = |k: u32| (f64::from(k) + 0.5) / f64::from(side);
                     let pixel = [f64::from(x) + offset(sub % side), f64::from(y) + offset(sub / side)];
                     let ray = Ray { origin, direction: pixel_ray(camera, pose, pixel) };
-                    // Where nothing is, open water is seen.
+                    // Without a surface, the ray shows open water.
                     let (radiance, range) = match world.hit(&ray, FARTHEST) {
                         Some(hit) => {
                             met.add(hit.material);
@@ -341,7 +347,7 @@ impl Photograph {
         self.grey(|met| ((255 * met.surface + self.rays / 2) / self.rays) as u8)
     }
 
-    /// What kind of surface is seen; the numbers are those of the file's head.
+    /// The kind of surface, by the numbers at the head of this file.
     fn kind(&self) -> GrayImage {
         self.grey(|met| match met {
             Met { surface: 0, .. } => 0,

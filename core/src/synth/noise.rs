@@ -20,7 +20,7 @@ pub(super) fn lattice(x: i32, y: i32, z: i32, seed: u32) -> f64 {
     f64::from(lattice_bits(x, y, z, seed)) * (1.0 / 4_294_967_296.0)
 }
 
-/// Smooth value noise in [0, 1], one feature a unit.
+/// Smooth value noise in [0, 1], with one feature per unit of length.
 pub(super) fn value(p: DVec3, seed: u32) -> f64 {
     let cell = p.floor();
     let f = p - cell;
@@ -51,20 +51,21 @@ pub(super) fn fractal_flat(x: f64, z: f64, octaves: u32, seed: u32) -> f64 {
         sum += weight * value_flat(q.0, q.1, seed.wrapping_add(octave));
         total += weight;
         weight *= 0.5;
-        // Turned by 37 degrees as well, so that no direction of the lattice shows.
+        // Also rotated by 37 degrees, so that the axes of the lattice do not show.
         q = (1.62 * q.0 - 1.22 * q.1 + 17.3, 1.22 * q.0 + 1.62 * q.1 + 9.1);
     }
     sum / total
 }
 
-/// Sum of `octaves` of [`value`], each half as strong and twice as fine; in [0, 1], mean 0.5.
+/// Weighted mean of `octaves` of [`value`], each with half the weight and twice the frequency; in [0, 1],
+/// mean 0.5.
 pub(super) fn fractal(p: DVec3, octaves: u32, seed: u32) -> f64 {
     let (mut sum, mut weight, mut total, mut q) = (0.0, 1.0, 0.0, p);
     for octave in 0..octaves {
         sum += weight * value(q, seed.wrapping_add(octave));
         total += weight;
         weight *= 0.5;
-        // Not exactly 2, and shifted: lattices of different octaves never coincide.
+        // Not exactly 2, and shifted, so that lattices of different octaves never coincide.
         q = q * 2.03 + DVec3::new(17.3, 5.7, 9.1);
     }
     sum / total

@@ -1,5 +1,5 @@
-//! Sparse points as structure from motion would give them: on surfaces, seen by two views and more,
-//! a fraction of a pixel off, with the colour that the photographs show.
+//! Sparse points like those of structure from motion. They are on surfaces, seen by at least two views, with
+//! an error of a fraction of a pixel and the colour of the photographs.
 
 use glam::DVec3;
 use rayon::prelude::*;
@@ -9,12 +9,12 @@ use super::{Photograph, pixel_ray};
 use crate::rng::{Stream, random_bits, uniform};
 use crate::scene::{PinholeCamera, Pose};
 
-/// Points that each view starts.
+/// Candidate points of each view.
 const PER_VIEW: u32 = 90;
 /// Error of a point across the line of sight, pixels, one standard deviation.
 pub(super) const ERROR_PX: f64 = 0.3;
 
-/// One point and where it was seen.
+/// One point and its observations.
 pub(super) struct SparsePoint {
     pub position: DVec3,
     pub colour: [u8; 3],
@@ -38,14 +38,14 @@ pub(super) fn sparse_points(
                 .map(|b| f64::from(uniform(b)));
             let pixel = [random[0] * f64::from(camera.width), random[1] * f64::from(camera.height)];
             let ray = Ray { origin: pose.centre(), direction: pixel_ray(camera, pose, pixel) };
-            // On what has one colour a detector finds nothing.
+            // A detector finds no features on a constant colour.
             let hit = world.hit(&ray, 60.0).filter(|hit| !hit.material.is_smooth())?;
             let surface = ray.origin + ray.direction * hit.range;
             let track: Vec<_> = (0_u32..)
                 .zip(poses)
                 .filter_map(|(other, pose)| {
                     let pixel = project(camera, pose, surface)?;
-                    // A grazing surface gives a detector nothing to hold on to.
+                    // A detector finds no features at grazing angles.
                     let way = (pose.centre() - surface).normalize();
                     (hit.normal.dot(way) > 0.2 && world.sees(pose.centre(), surface))
                         .then_some((other, pixel))
@@ -68,7 +68,7 @@ pub(super) fn sparse_points(
         .collect()
 }
 
-/// Pixel of a world point, when it lies in the picture, two pixels from its rim.
+/// Pixel of a world point, if it is in the picture and at least two pixels from its rim.
 fn project(camera: &PinholeCamera, pose: &Pose, point: DVec3) -> Option<[f64; 2]> {
     let p = pose.transform(point);
     if p.z < 0.1 {

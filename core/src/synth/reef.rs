@@ -1,11 +1,10 @@
-//! Builds the world of the forward look: the wreck on a reef that ends, so that there is open water behind
-//! it.
+//! Builds the world of the forward look: the wreck on a bounded reef, with open water behind it.
 //!
-//! A plateau with a crest along its rim, beyond which the floor falls away; nothing is left of it where the
-//! water has taken all of its light. Heads of coral stand on the crest, some above the horizon, and are the
-//! far reef of who looks across. Some are dark and look much as open water does. Plates and patches of sand
-//! of one colour have nothing on them that could be found again. Metres and axes as in [`super::wreck`]; the
-//! seed moves heads, what lies about, and textures.
+//! The reef is a plateau with a crest along its rim, beyond which the floor falls away. The floor ends where
+//! the water has absorbed all of its light. Coral heads on the crest, some above the horizon, are the distant
+//! background of views across the plateau. Some are dark and look similar to open water. Plates and patches
+//! of sand with constant colour have no features to match. Metres and axes as in [`super::wreck`]; the seed
+//! moves coral heads, scattered objects and textures.
 
 use glam::{DMat3, DVec3};
 
@@ -16,15 +15,15 @@ use crate::rng::{Stream, uniform_at};
 
 /// Half the length and half the width of the plateau.
 const PLATEAU: Patch = Patch { centre: [0.0, 0.0], radii: [25.0, 19.0] };
-/// How far the floor falls beyond the rim, metres across; it falls 0.6 a metre.
+/// Width of the slope beyond the rim, metres; the floor falls 0.6 m per metre.
 const FALL: f64 = 12.0;
-/// Where the sand is smooth.
+/// Areas of smooth sand.
 const SMOOTH: [Patch; 2] =
     [Patch { centre: [-11.5, 1.5], radii: [2.9, 2.3] }, Patch { centre: [11.0, -3.5], radii: [2.4, 2.0] }];
-/// Heads on the crest, and stones all over.
+/// Number of coral heads on the crest, and of stones everywhere.
 const HEADS: u32 = 38;
 const STONES: u32 = 220;
-/// First of the random numbers of this file; those of [`Yard::scatter`] end below.
+/// Index of the first random number of this file; those of [`Yard::scatter`] are below.
 const FIRST: u32 = 1000;
 
 pub(super) fn build(seed: u32) -> World {
@@ -56,7 +55,7 @@ fn floor_y(x: f64, z: f64, seed: u32) -> f64 {
     fall - crest - rough * (wide + bumps) - pile
 }
 
-/// What was put there: a mast that still stands, dark slabs, plates of one colour.
+/// Adds a standing mast, dark slabs, and plates of constant colour.
 fn stand(yard: &mut Yard) {
     yard.bar(DVec3::new(-2.9, -0.9, 0.1), DVec3::new(-3.3, -6.6, 0.5), 0.14, Material::Timber);
     yard.bar(DVec3::new(-3.35, -4.7, -1.3), DVec3::new(-3.05, -5.1, 2.0), 0.08, Material::Timber);
@@ -74,7 +73,7 @@ fn stand(yard: &mut Yard) {
     }
 }
 
-/// Heads of coral on the crest, where no camera passes, and stones.
+/// Adds coral heads on the crest, where no camera passes, and stones.
 fn grow(yard: &mut Yard, floor: &SeaFloor) {
     let seed = yard.seed;
     let random = |item: u32, k: u32| f64::from(uniform_at(seed, Stream::Synth, FIRST + item, k));
@@ -86,7 +85,7 @@ fn grow(yard: &mut Yard, floor: &SeaFloor) {
         let (x, z) = (out * PLATEAU.radii[0] * angle.cos(), out * PLATEAU.radii[1] * angle.sin());
         let material = if head % 4 == 1 { Material::Dark } else { Material::Rock };
         let (wide, tall) = (0.9 + 1.1 * random(2), 0.8 + 2.4 * random(3) * random(3));
-        // Dark ones stand above the horizon.
+        // Dark heads reach above the horizon.
         let tall = if material == Material::Dark { tall + 1.0 } else { tall };
         for lump in 0..4 {
             let at = |k: u32| random(4 + 5 * lump + k);

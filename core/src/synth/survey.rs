@@ -1,11 +1,11 @@
 //! The dive: three lawn-mower lines along the wreck, then an orbit around it.
 //!
-//! The surveyed area is about three times as long as wide, so cutting it in two along either axis gives
-//! partitions of some size. Lines look down with a tilt that changes from picture to picture.
+//! The surveyed area is about three times as long as wide, so that halves along either axis are partitions of
+//! a usable size. On the lines the camera looks down with a tilt that changes from picture to picture.
 //!
 //! The forward look is another dive, two to three metres above the floor with the camera 6 to 15 degrees
-//! below the horizon: along one side of the wreck and back along the other, past it and beyond, then a spiral
-//! around it. Ahead swims a diver towards what is seen, so that most of it is seen from afar and from near.
+//! below the horizon. It passes the wreck on one side, returns on the other and ends in a spiral around it.
+//! The diver swims towards what the camera shows, so most surfaces are seen from far and near.
 
 use glam::DVec3;
 
@@ -27,12 +27,12 @@ pub(super) fn camera(width: u32, height: u32) -> PinholeCamera {
 
 /// Offset of the lanes of the forward look from the wreck, metres.
 const LANE: f64 = 5.4;
-/// Where a lane begins and ends, metres along the wreck; the way back mirrors it.
+/// Start and end of a lane, metres along the wreck; the return lane mirrors it.
 const LANE_ENDS: [f64; 2] = [-17.0, 8.0];
-/// Radii of the spiral in the middle of its turn, metres.
+/// Radii of the spiral, metres; a factor that grows from 0.98 to 1.25 scales them.
 const SPIRAL: [f64; 2] = [12.2, 8.2];
 
-/// `count` poses of the dive that looks ahead, in its order.
+/// `count` poses of the forward look, in the order of the dive.
 pub(super) fn forward_poses(count: u32, seed: u32) -> Vec<Pose> {
     let random = |view: u32, k: u32| f64::from(uniform_at(seed, Stream::Synth, 10_000 + view, k)) - 0.5;
     let on_lanes = count / 2;
@@ -41,7 +41,7 @@ pub(super) fn forward_poses(count: u32, seed: u32) -> Vec<Pose> {
         let eye = eye + DVec3::new(0.3 * random(view, 0), 0.7 * random(view, 1), 0.3 * random(view, 2));
         let (yaw, pitch) = (yaw + 0.16 * random(view, 3), (10.5 + 9.0 * random(view, 4)).to_radians());
         let ahead = DVec3::new(yaw.cos() * pitch.cos(), pitch.sin(), yaw.sin() * pitch.cos());
-        // A diver does not keep quite level.
+        // A diver is never quite level.
         let down = DVec3::new(0.08 * random(view, 5), 1.0, 0.08 * random(view, 6));
         Pose::looking_at(eye, eye + ahead, down)
     };
@@ -51,7 +51,7 @@ pub(super) fn forward_poses(count: u32, seed: u32) -> Vec<Pose> {
                 if view < first { (view, first, 1.0) } else { (view - first, on_lanes - first, -1.0) };
             let way = (f64::from(step) + 0.5) / f64::from(steps.max(1));
             let x = side * (LANE_ENDS[0] + (LANE_ENDS[1] - LANE_ENDS[0]) * way);
-            // Ahead, turned towards the wreck, and from side to side.
+            // The camera looks ahead, turned towards the wreck, and swings from side to side.
             let swing = 0.32 + 0.30 * (std::f64::consts::TAU * 2.5 * way).sin();
             let heading = if side > 0.0 { 0.0 } else { std::f64::consts::PI };
             return look(view, DVec3::new(x, -2.5, side * LANE), heading - swing);
@@ -88,7 +88,7 @@ pub(super) fn poses(count: u32, seed: u32) -> Vec<Pose> {
             );
             let ahead = heading * (0.5 + 1.4 * random(view, 3));
             let target = DVec3::new(eye.x + ahead, 0.0, 0.62 * z + 0.8 * random(view, 4));
-            // In the picture, up is the way ahead.
+            // In the picture, up is the direction of travel.
             poses.push(Pose::looking_at(eye, target, DVec3::new(-heading, 0.3, 0.1 * random(view, 5))));
         }
     }

@@ -1,4 +1,4 @@
-//! What a synthetic scene promises.
+//! Properties of synthetic scenes.
 
 use super::*;
 
@@ -22,7 +22,7 @@ fn decode(v: u8) -> f64 {
     crate::picture::srgb_to_linear(f64::from(v) / 255.0)
 }
 
-/// z-depth of view `view` of those with truth, metres.
+/// z-depth of the `view`-th view with ground truth, metres.
 fn depths(folder: &Path, view: usize, (width, height): (usize, usize)) -> Vec<f32> {
     let npz = bytes_of(folder, "truth/depth_m.npz");
     let header = 30 + "v0001.npy".len() + 128;
@@ -51,7 +51,7 @@ const FILES: [&str; 6] = [
 ];
 
 #[test]
-fn the_same_options_give_the_same_bytes_on_any_number_of_threads() {
+fn equal_options_give_equal_bytes_on_any_number_of_threads() {
     let many = made(&small());
     let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
     let one = pool.install(|| made(&small()));
@@ -86,8 +86,8 @@ fn the_photograph_is_the_truth_seen_through_the_water() {
             sum += error;
         }
     }
-    // Noise of 0.004 sqrt(I) is below 3 steps of 8 bits here, four deviations 12; a pixel on an edge mixes
-    // ranges.
+    // Noise of 0.004 sqrt(I) is below 3 steps of 8 bits here, so four standard deviations are 12. A pixel on
+    // an edge mixes ranges.
     assert!(worst < 40.0, "worst {worst}");
     assert!((sum / (48.0 * 36.0 * 3.0)).abs() < 0.5, "mean error {sum}");
 }
@@ -103,7 +103,7 @@ fn without_water_the_photograph_is_the_clear_picture_and_noise() {
 }
 
 #[test]
-fn every_sparse_point_lies_where_its_track_says() {
+fn every_sparse_point_projects_to_its_track() {
     let options = small();
     let world = wreck::build(options.seed);
     let camera = survey::camera(options.width, options.height);
@@ -118,8 +118,8 @@ fn every_sparse_point_lies_where_its_track_says() {
             let p = poses[*view as usize].transform(point.position);
             let (dx, dy) =
                 (camera.fx * p.x / p.z + camera.cx - pixel[0], camera.fy * p.y / p.z + camera.cy - pixel[1]);
-            // 0.3 px of noise at the view that found the point, at most three times nearer elsewhere, four
-            // deviations.
+            // The noise is 0.3 px in the view that found the point; other views are at most three times
+            // nearer. The limit is five standard deviations.
             assert!(dx.hypot(dy) < 0.3 * 3.0 * 5.0, "view {view}: off by {dx} {dy} pixels");
         }
     }
@@ -133,7 +133,7 @@ fn a_folder_that_holds_a_scene_is_not_overwritten() {
 }
 
 #[test]
-fn options_that_make_no_scene_are_refused_by_name() {
+fn invalid_options_are_refused_by_name() {
     let folder = tempfile::tempdir().unwrap();
     let refuse =
         |options: SynthOptions| synthesise(folder.path(), &options, |_, _| ()).unwrap_err().to_string();
@@ -148,7 +148,7 @@ fn options_that_make_no_scene_are_refused_by_name() {
 }
 
 #[test]
-fn the_look_down_has_no_open_water_and_no_more_truth_than_it_had() {
+fn looking_down_there_is_no_open_water_and_no_alpha_or_kind() {
     assert_eq!(SynthOptions::default().look, Look::Down);
     let folder = made(&small());
     assert!(!folder.path().join("truth/alpha").exists() && !folder.path().join("truth/kind").exists());
@@ -170,7 +170,7 @@ fn the_forward_look_is_the_same_on_any_number_of_threads() {
 }
 
 #[test]
-fn looking_forward_much_is_open_water_and_every_kind_of_surface_is_seen() {
+fn looking_forward_shows_open_water_and_all_kinds_of_surface() {
     let folder = made(&SynthOptions { views: 72, ..small_forward() });
     let (mut of_kind, mut open_views) = ([0_usize; 4], 0);
     for view in (1..=72).step_by(TRUTH_EVERY) {
@@ -189,7 +189,7 @@ fn looking_forward_much_is_open_water_and_every_kind_of_surface_is_seen() {
             assert!(*kind < 2 || *alpha == 255, "dark and smooth are whole pixels");
             assert!(*alpha > 0 || clear.0 == [0; 3], "there is no J of open water");
         }
-        // A quarter to a third is usual.
+        // Typically a quarter to a third.
         open_views += usize::from((0.15..0.45).contains(&(open as f64 / (48.0 * 36.0))));
     }
     assert!(open_views >= 8, "{open_views} of 9 held-out views show 15 to 45 % of open water");
@@ -201,7 +201,7 @@ fn looking_forward_much_is_open_water_and_every_kind_of_surface_is_seen() {
 }
 
 #[test]
-fn looking_forward_the_photograph_is_the_truth_under_water_that_is_brighter_upwards() {
+fn looking_forward_the_water_is_brighter_upwards() {
     let options = small_forward();
     let folder = made(&options);
     let camera = survey::camera(48, 36);
@@ -229,7 +229,7 @@ fn looking_forward_the_photograph_is_the_truth_under_water_that_is_brighter_upwa
                     }
                     encode(DVec3::from(water.b_inf))
                 }
-                // The rays of a pixel of a rough far floor differ in range; here they hardly do.
+                // On a distant rough floor, the ranges of a pixel's rays differ; here they hardly do.
                 [255] if range < 6.0 || kind.get_pixel(x, y).0 == [2] => {
                     dark += u32::from(kind.get_pixel(x, y).0 == [2]);
                     encode(water.apply(DVec3::from(clear.get_pixel(x, y).0.map(decode)), range))
@@ -253,7 +253,7 @@ fn looking_forward_the_photograph_is_the_truth_under_water_that_is_brighter_upwa
 }
 
 #[test]
-fn looking_forward_points_are_seen_from_several_ranges_and_none_is_smooth() {
+fn looking_forward_points_have_several_ranges_and_texture() {
     let options = SynthOptions { views: 72, ..small_forward() };
     let world = options.look.world(options.seed);
     let camera = survey::camera(options.width, options.height);
@@ -283,7 +283,7 @@ fn looking_forward_points_are_seen_from_several_ranges_and_none_is_smooth() {
         photograph.met[(*y as u32 * options.width + *x as u32) as usize].smooth == photograph.rays
     });
     let observations = points.iter().map(|point| point.track.len()).sum::<usize>();
-    // What is left are points that lie within the depth that `sees` allows behind the foot of a plate.
+    // The rest are points behind the foot of a plate, within the tolerance of `sees`.
     let on_smooth = on_smooth.count();
     assert!(
         500 * on_smooth < observations,

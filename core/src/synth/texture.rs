@@ -1,28 +1,28 @@
-//! What surfaces look like: albedo in linear light from several scales of noise, and daylight on it.
+//! Appearance of surfaces: albedo in linear light from several scales of noise, lit by daylight.
 //!
-//! Contrast at many scales is the point: structure from motion and splatting both live on it. The
-//! finest features are about 4 cm, a pixel and a half at the usual distance, so nothing aliases.
+//! Structure from motion and splatting need contrast at many scales. The finest features are about 4 cm, a
+//! pixel and a half at the usual distance, so nothing aliases.
 
 use glam::DVec3;
 
 use super::geometry::{Hit, Material, Ray, World};
 use super::noise::{fractal, fractal_flat, lattice, ramp, value_flat};
 
-/// Towards the light: from above, a little from the side. y points down.
+/// Direction towards the light: up and slightly to the side. y points down.
 const LIGHT: DVec3 = DVec3::new(0.36, -0.85, 0.38);
 
 /// J of surfaces of one colour, linear light.
 const SMOOTH_PALE: DVec3 = DVec3::new(0.40, 0.42, 0.39);
 const SMOOTH_BLUE: DVec3 = DVec3::new(0.06, 0.15, 0.21);
 const SMOOTH_SAND: DVec3 = DVec3::new(0.33, 0.28, 0.20);
-/// J in the middle of dark surfaces, linear light: near the `b_inf` of [`crate::water::Water::COASTAL`], so
-/// that there is little between their colour and that of open water at any range.
+/// Mean J of dark surfaces, linear light: close to the `b_inf` of [`crate::water::Water::COASTAL`], so that
+/// they look similar to open water at any range.
 const DARK: DVec3 = DVec3::new(0.021, 0.082, 0.122);
 
-/// J: what a camera would see of a hit without water, linear light.
+/// J: the radiance of a hit without water, linear light.
 pub(super) fn radiance(world: &World, ray: &Ray, hit: &Hit, seed: u32) -> DVec3 {
     match hit.material {
-        // Without shadows and shades: one colour is what they are for.
+        // No shadows or shading: these surfaces have constant colour.
         Material::SmoothPale => return SMOOTH_PALE,
         Material::SmoothBlue => return SMOOTH_BLUE,
         Material::SmoothSand => return SMOOTH_SAND,
@@ -41,7 +41,7 @@ pub(super) fn radiance(world: &World, ray: &Ray, hit: &Hit, seed: u32) -> DVec3 
 
 fn albedo(hit: &Hit, seed: u32) -> DVec3 {
     let p = hit.local;
-    // A shift of its own for each part, so that two barrels do not look the same.
+    // Each part has its own shift, so that two barrels look different.
     let own = p + DVec3::splat(f64::from(hit.seed % 1021) * 3.7);
     match hit.material {
         Material::Sand => sand(p, seed),
@@ -50,7 +50,7 @@ fn albedo(hit: &Hit, seed: u32) -> DVec3 {
         Material::Timber => timber(own, hit.seed),
         Material::Planks => planks(own, p, hit.seed),
         Material::Painted => painted(own, hit.seed),
-        // What these look like is not albedo under a light.
+        // `radiance` does not use the albedo of these.
         Material::Dark => DARK,
         Material::SmoothPale => SMOOTH_PALE,
         Material::SmoothBlue => SMOOTH_BLUE,
@@ -58,7 +58,7 @@ fn albedo(hit: &Hit, seed: u32) -> DVec3 {
     }
 }
 
-/// Sponge that has hardly any relief in blue light: within a quarter of [`DARK`].
+/// Sponge with hardly any relief in blue light: within a quarter of [`DARK`].
 fn dark(hit: &Hit) -> DVec3 {
     let own = hit.local + DVec3::splat(f64::from(hit.seed % 1021) * 3.7);
     let coarse = fractal(own * 1.9, 3, hit.seed ^ 0xA1);
@@ -77,7 +77,7 @@ fn sand(p: DVec3, seed: u32) -> DVec3 {
     // Weed and dark silt in patches.
     let weed = ramp(0.50, 0.62, fractal_flat(x * 0.8 + 40.0, z * 0.8, 4, seed ^ 0x54));
     colour = colour.lerp(DVec3::new(0.06, 0.085, 0.045) * (0.5 + 1.4 * fine), 0.88 * weed);
-    // Gravel lies where the sand is pale.
+    // Gravel in pale sand.
     let gravel = 0.4 * ramp(0.35, 0.6, wide);
     if let Some(stone) = pebble(p, 0.36, gravel, seed ^ 0x55) {
         colour = stone;
@@ -85,7 +85,7 @@ fn sand(p: DVec3, seed: u32) -> DVec3 {
     colour
 }
 
-/// Colour of a pebble when one lies at `p`: at most one a cell, an ellipse that stays in its cell.
+/// Colour of the pebble at `p`, if any: an ellipse within its cell, at most one a cell.
 fn pebble(p: DVec3, cell: f64, share: f64, seed: u32) -> Option<DVec3> {
     let (ix, iz) = ((p.x / cell).floor(), (p.z / cell).floor());
     let at = |k: i32| lattice(ix as i32, k, iz as i32, seed);

@@ -1,8 +1,8 @@
 //! Builds the world: a listing hull with ribs, keelson, decks, deckhouse, boiler and fallen mast on an
 //! undulating floor, with plates, barrels, an anchor and rocks around it.
 //!
-//! Metres; x along the ship, y down, z across. The seed moves what lies about and all textures; the
-//! ship stays.
+//! Units are metres; x along the ship, y down, z across. The seed moves scattered objects and all textures,
+//! but not the ship.
 
 use glam::{DMat3, DVec3};
 
@@ -32,7 +32,7 @@ fn floor_y(x: f64, z: f64, seed: u32) -> f64 {
     -(dunes + bumps + pile)
 }
 
-/// What stands and lies about.
+/// Collects the parts of a world.
 pub(super) struct Yard {
     pub seed: u32,
     pub parts: Vec<Part>,
@@ -59,7 +59,7 @@ impl Yard {
         let at = |x: f64, y: f64, z: f64| HULL_CENTRE + list * DVec3::new(x, y, z);
         self.add(Shape::TornHull(HULL), HULL_CENTRE, list, Material::Iron);
 
-        // Gunwales and ribs follow the hull's ellipse a hand's breadth inside it.
+        // Gunwales and ribs follow the hull's ellipse slightly inside it.
         let inside = HULL * 0.985;
         let rim = |x: f64, angle: f64| {
             let width = (1.0 - (x / inside.x).powi(2)).max(0.0).sqrt();
@@ -68,7 +68,7 @@ impl Yard {
         for side in [0.0, std::f64::consts::PI] {
             for step in 0..14 {
                 let x = |s: i32| -6.5 + 13.0 * f64::from(s) / 14.0;
-                // The breach has taken the gunwale there.
+                // The breach has removed the gunwale there.
                 if side == 0.0 && (6..10).contains(&step) {
                     continue;
                 }
@@ -84,7 +84,7 @@ impl Yard {
         }
         self.bar(at(-5.6, 0.9, 0.0), at(5.6, 0.9, 0.0), 0.14, Material::Timber);
 
-        // Decks at stern and bow, beams where the planks are gone.
+        // Decks at stern and bow; beams without planks between them.
         self.add(Shape::Block(DVec3::new(1.35, 0.05, 1.12)), at(-4.25, 0.12, 0.0), list, Material::Planks);
         self.add(Shape::Block(DVec3::new(1.0, 0.05, 1.0)), at(4.6, 0.12, 0.0), list, Material::Planks);
         for beam in 0..4 {
@@ -111,7 +111,7 @@ impl Yard {
         );
         self.add(Shape::Block(DVec3::new(0.5, 0.35, 0.42)), at(1.25, 0.62, -0.15), list, Material::Painted);
 
-        // The mast has fallen over the side; its spar lies across.
+        // The mast has fallen over the side; its spar crosses it.
         self.bar(at(2.4, -0.2, -0.5), DVec3::new(4.7, -0.05, 4.7), 0.13, Material::Timber);
         self.bar(DVec3::new(2.9, -0.22, 3.9), DVec3::new(5.4, -0.5, 2.6), 0.075, Material::Timber);
         self.bar(at(-5.4, 0.0, 0.0), at(-5.5, -1.0, 0.1), 0.07, Material::Iron);
@@ -132,7 +132,7 @@ impl Yard {
         }
     }
 
-    /// Plates, planks, barrels, crates and rocks, dense near the ship, each resting in the sand.
+    /// Adds plates, planks, barrels, crates and rocks in the sand, denser near the ship.
     pub fn scatter(&mut self, floor: &SeaFloor) {
         let seed = self.seed;
         for item in 0..150_u32 {
@@ -144,7 +144,7 @@ impl Yard {
             }
             let from_hull = ((x / (HULL.x + 0.4)).powi(2) + (z / (HULL.z + 0.5)).powi(2)).sqrt();
             if from_hull < 1.0 {
-                // Inside the hull: to the outside, on the same side.
+                // Items inside the hull move outside, on the same side.
                 let push = 1.05 + 0.5 * random(9);
                 (x, z) = (x * push / from_hull.max(0.05), z * push / from_hull.max(0.05));
             }

@@ -1,4 +1,4 @@
-//! COLMAP models, right and wrong.
+//! Valid and invalid COLMAP models.
 
 use super::fixture::{CameraEntry, Dataset, HEIGHT, Model, WIDTH, assert_says, pinhole, write_png};
 use crate::scene::{CameraModel, Pose, Purpose};
@@ -17,7 +17,7 @@ fn binary_and_text_give_the_same_scene() {
 }
 
 #[test]
-fn everything_that_a_model_says_is_read_and_sorted_by_name() {
+fn all_parts_of_a_model_are_read_and_sorted_by_name() {
     let dataset = Dataset::binary(&Model::sample());
     let scene = dataset.train();
     assert_eq!(scene.warnings, Vec::<String>::new());
@@ -42,7 +42,7 @@ fn everything_that_a_model_says_is_read_and_sorted_by_name() {
 #[test]
 fn tracks_name_the_views_in_their_order_by_name() {
     let mut model = Model::sample();
-    // Twice in one image, as a wrong match gives, and in one that the model does not have.
+    // Twice in one image, as after a wrong match, and once in an image that the model lacks.
     model.points[3].track = vec![12, 11, 12, 99];
     let seen_by =
         |scene: &crate::scene::Scene| [0, 1, 2, 3].map(|point| scene.points.tracks.of(point).to_vec());
@@ -79,7 +79,7 @@ fn models_are_found_wherever_programs_put_them() {
 }
 
 #[test]
-fn photographs_may_lie_in_the_folder_itself() {
+fn photographs_may_be_in_the_folder_itself() {
     let dataset = Dataset::empty();
     Model::sample().write_photographs(&dataset.path(""));
     Model::sample().write_binary(&dataset.path("sparse/0"));
@@ -103,7 +103,7 @@ fn rigs_and_frames_of_new_models_are_ignored() {
 }
 
 #[test]
-fn all_18_camera_models_keep_the_place_in_the_file() {
+fn all_18_camera_models_have_their_number_of_parameters() {
     // Numbers of parameters in sensor/models.h of COLMAP 4.1, in the order of the ids.
     let counts = [3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16, 4, 5, 3, 4, 6, 2];
     let mut model = Model::sample();
@@ -132,7 +132,7 @@ fn all_18_camera_models_keep_the_place_in_the_file() {
 }
 
 #[test]
-fn a_camera_model_that_cannot_be_undistorted_is_refused_for_training_only() {
+fn models_that_cannot_be_undistorted_are_refused_for_training() {
     let mut model = Model::sample();
     model.cameras[0] = CameraEntry {
         model: 5,
@@ -146,7 +146,7 @@ fn a_camera_model_that_cannot_be_undistorted_is_refused_for_training_only() {
 }
 
 #[test]
-fn the_biggest_of_several_models_is_taken_and_the_lost_images_are_counted() {
+fn the_largest_of_several_models_is_read_with_a_warning() {
     let dataset = Dataset::binary(&Model::sample());
     let mut small = Model::sample();
     small.images.truncate(1);
@@ -159,7 +159,7 @@ fn the_biggest_of_several_models_is_taken_and_the_lost_images_are_counted() {
         &scene.warnings[0],
         &["3 COLMAP models", "sparse/0 (3 images)", "2 images of", "model_merger"],
     );
-    // The name of the folder decides nothing.
+    // The folder name does not matter.
     small.write_binary(&dataset.path("sparse/0"));
     Model::sample().write_binary(&dataset.path("sparse/1"));
     assert_says(&dataset.train().warnings[0], &["sparse/1 (3 images)"]);
@@ -202,7 +202,7 @@ fn a_truncated_file_is_refused_by_name_and_offset() {
     let dataset = Dataset::binary(&model);
     let bytes = model.images_bin();
     dataset.write("sparse/0/images.bin", &bytes[..bytes.len() - 30]);
-    // The third image starts behind the count, 64 + 17 + 8 + 48 bytes of the first and 64 + 6 + 8 of the
+    // The third image starts after the count, 64 + 17 + 8 + 48 bytes of the first image and 64 + 6 + 8 of the
     // second.
     let what = "the 2D points of image 3 of 3 (left cam/c.png)";
     assert_says(&dataset.refused("images.bin"), &["byte 302", what]);
@@ -237,7 +237,7 @@ fn an_absurd_count_allocates_nothing_and_is_refused() {
             assert_says(&dataset.refused(file), &["byte 0", &count.to_string()]);
         }
     }
-    // The same inside an image: its number of 2D points.
+    // The same for a count inside an image: its number of 2D points.
     let mut bytes = model.images_bin();
     let at = 8 + 64 + 17;
     bytes[at..at + 8].copy_from_slice(&u64::MAX.to_le_bytes());
@@ -264,7 +264,7 @@ fn a_pose_that_is_not_finite_is_refused_by_image_and_place() {
 }
 
 #[test]
-fn cameras_and_points_beyond_any_scene_are_refused_or_left_out_before_squares_of_them_overflow() {
+fn coordinates_whose_squares_overflow_are_refused_or_left_out() {
     let mut model = Model::sample();
     model.images[1].translation[0] = 1e200;
     for (message, place) in [
@@ -308,7 +308,7 @@ fn a_zero_quaternion_is_refused() {
 }
 
 #[test]
-fn cameras_that_cannot_be_are_refused() {
+fn impossible_cameras_are_refused() {
     let wrong = |change: &dyn Fn(&mut CameraEntry)| {
         let mut model = Model::sample();
         change(&mut model.cameras[0]);
@@ -355,7 +355,7 @@ fn names_that_leave_the_folder_are_refused() {
 }
 
 #[test]
-fn torn_text_is_refused_by_line() {
+fn damaged_text_is_refused_by_line() {
     let model = Model::sample();
     let (images, points) = (model.images_txt(), model.points_txt());
     for (file, text, parts) in [
@@ -366,7 +366,7 @@ fn torn_text_is_refused_by_line() {
             ["line 4", "\"half\" is not a number"],
         ),
         ("images.txt", images.replace("2.5 -1 1.5", "2.5 1.5"), ["line 3", "multiple of three"]),
-        // The empty line of a.png was lost: the next image is taken for its points.
+        // The empty line of a.png is missing, so the next image is read as its points.
         ("images.txt", images.replace("a.png\n\n", "a.png\n"), ["line 5", "multiple of three"]),
         (
             "points3D.txt",
@@ -376,7 +376,7 @@ fn torn_text_is_refused_by_line() {
         (
             "points3D.txt",
             points.replace("1 128 255", "1 300 255"),
-            ["line 3", "\"300\" stands where a colour"],
+            ["line 3", "found \"300\" instead of a colour"],
         ),
         ("points3D.txt", points.replace("0.5 12 7", "0.5 12"), ["line 3", "the 2D point of a track"]),
         ("cameras.txt", model.cameras_txt().replace("8 6", "8 six"), ["line 2", "\"six\""]),
@@ -388,20 +388,20 @@ fn torn_text_is_refused_by_line() {
 }
 
 #[test]
-fn a_picture_of_another_size_than_its_camera_is_refused_or_for_inspect_warned_of() {
+fn a_size_that_differs_from_the_camera_is_refused_or_warned_of() {
     let dataset = Dataset::binary(&Model::sample());
     write_png(&dataset.path("images/a.png"), 16, 12);
     assert_says(&dataset.refused("images/a.png"), &["16x12", "8x6"]);
     let scene = dataset.inspect();
     assert_eq!(scene.views.len(), 3);
     assert_says(&scene.warnings[0], &["1 images cannot be trained on", "16x12"]);
-    // A picture on its side: the usual cause has a name.
+    // A rotated picture: the message names the usual cause.
     write_png(&dataset.path("images/a.png"), HEIGHT, WIDTH);
     assert_says(&dataset.refused("images/a.png"), &["EXIF"]);
 }
 
 #[test]
-fn unreadable_and_truncated_pictures_are_refused_before_anything_starts() {
+fn unreadable_and_truncated_pictures_are_refused_at_once() {
     let mut model = Model::sample();
     model.images[1].name = "a.jpg".to_owned();
     let dataset = Dataset::binary(&model);
@@ -421,7 +421,7 @@ fn unreadable_and_truncated_pictures_are_refused_before_anything_starts() {
 }
 
 #[test]
-fn missing_pictures_are_left_out_and_named_and_none_at_all_is_refused() {
+fn missing_pictures_are_named_but_not_all_may_be_missing() {
     let dataset = Dataset::binary(&Model::sample());
     std::fs::remove_file(dataset.path("images/a.png")).unwrap();
     let scene = dataset.train();
@@ -446,7 +446,7 @@ fn pictures_are_found_when_only_the_case_of_their_names_differs() {
 }
 
 #[test]
-fn no_points_are_refused_for_training_and_told_for_inspect() {
+fn no_points_are_refused_for_training_and_a_warning_for_inspect() {
     let mut model = Model::sample();
     model.points.clear();
     let dataset = Dataset::binary(&model);
@@ -536,7 +536,7 @@ fn no_damaged_byte_makes_a_reader_panic() {
 }
 
 #[test]
-fn coordinates_that_f32_cannot_resolve_are_warned_of() {
+fn coordinates_that_f32_cannot_resolve_give_a_warning() {
     let mut model = Model::sample();
     for image in &mut model.images {
         // UTM: centres millions of units from the origin, a few units apart.

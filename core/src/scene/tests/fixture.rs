@@ -1,4 +1,4 @@
-//! A small scene on disk, written byte by byte here so that the readers are not checked against themselves.
+//! A small scene on disk, written byte by byte so that the readers are not tested against themselves.
 
 use std::path::{Path, PathBuf};
 
@@ -39,7 +39,7 @@ pub struct PointEntry {
     pub track: Vec<u32>,
 }
 
-/// A model that is right until a test makes it wrong.
+/// A valid model that tests damage.
 #[derive(Clone)]
 pub struct Model {
     pub cameras: Vec<CameraEntry>,
@@ -221,7 +221,7 @@ impl Dataset {
         self.load_at("", Purpose::Inspect).unwrap()
     }
 
-    /// The message with which loading for training is refused; it must name `file`.
+    /// The error message of loading for training; it must name `file`.
     pub fn refused(&self, file: &str) -> String {
         let message = self.load_at("", Purpose::Train).unwrap_err().to_string();
         assert!(message.contains(file), "\"{message}\" does not name {file}");

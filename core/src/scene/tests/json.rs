@@ -53,7 +53,7 @@ fn opengl_cameras_become_world_to_camera() {
     assert_near(pose.centre(), DVec3::new(1.0, 2.0, 3.0));
     assert_near(pose.forward(), DVec3::NEG_Z);
     assert_near(pose.down(), DVec3::NEG_Y);
-    // One unit ahead, a bit to the right and below: positive x, y, z in our camera.
+    // One unit ahead, slightly to the right and below: positive x, y, z in our camera.
     assert_near(pose.transform(DVec3::new(1.25, 1.5, 2.0)), DVec3::new(0.25, 0.5, 1.0));
     assert_eq!(scene.cameras.len(), 1);
     assert_eq!(
@@ -72,7 +72,7 @@ fn the_file_itself_may_be_given() {
 }
 
 #[test]
-fn a_colmap_model_comes_first_and_the_choice_is_told() {
+fn a_colmap_model_comes_first_with_a_warning() {
     let dataset = dataset(&transforms());
     Model::sample().write_binary(&dataset.path("colmap/sparse/0"));
     Model::sample().write_photographs(&dataset.path("images"));
@@ -154,7 +154,7 @@ fn masks_of_frames_are_taken_and_must_exist() {
 }
 
 #[test]
-fn poses_that_are_none_are_refused_by_frame() {
+fn invalid_poses_are_refused_by_frame() {
     for (matrix, reason) in [
         (json!([[1, 0, 0, null], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]), "not finite"),
         (json!([[0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 1]]), "not a rotation"),
@@ -169,7 +169,7 @@ fn poses_that_are_none_are_refused_by_frame() {
 }
 
 #[test]
-fn frames_with_lenses_or_places_beyond_any_scene_are_refused_by_frame() {
+fn absurd_lenses_and_positions_are_refused_by_frame() {
     let mut far = transforms();
     far["frames"][2]["transform_matrix"] = json!([[1, 0, 0, 1e200], [0, 1, 0, 0], [0, 0, 1, 0]]);
     assert_says(&dataset(&far).refused("transforms.json"), &["frames[2]", "images/c", "from the origin"]);
@@ -213,14 +213,14 @@ fn other_faults_of_the_file_are_refused_with_their_place() {
 }
 
 #[test]
-fn an_applied_transform_is_told() {
+fn an_applied_transform_gives_a_warning() {
     let mut transforms = transforms();
     transforms["applied_transform"] = json!([[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]);
     assert_says(&dataset(&transforms).train().warnings[0], &["applied_transform", "transformed frame"]);
 }
 
 #[test]
-fn points_are_read_in_every_form_of_ply_and_torn_ones_refused() {
+fn points_are_read_from_every_kind_of_ply() {
     let mut transforms = transforms();
     let header = |format: &str| {
         format!(
@@ -269,16 +269,16 @@ fn views_keep_their_place_in_the_list() {
 }
 
 #[test]
-fn a_model_can_be_measured_without_points_and_without_views_to_train_on() {
+fn measuring_needs_no_points_and_no_views_to_train_on() {
     let mut transforms = transforms();
     transforms["ply_file_path"] = json!(null);
     transforms["frames"] = json!([frame("images/a.png"), frame("images/gone.png")]);
     let one = dataset(&transforms);
     assert_says(&one.refused(""), &["training needs at least two"]);
     let scene = one.load_at("", Purpose::Measure).unwrap();
-    assert_eq!(names(&scene), ["images/a.png"], "what has no photograph cannot be measured");
+    assert_eq!(names(&scene), ["images/a.png"], "a view without photograph cannot be measured");
     assert_says(&scene.warnings[0], &["gone.png", "left out"]);
-    // What is there must be right, as for training.
+    // Photographs that exist must be valid, as for training.
     write_png(&one.path("images/a.png"), WIDTH + 1, HEIGHT);
     let refused = one.load_at("", Purpose::Measure).unwrap_err().to_string();
     assert_says(&refused, &["a.png"]);
