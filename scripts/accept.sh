@@ -124,7 +124,7 @@ plans() {
 # 100,000 cameras and 10 million points into 16x16.
 plan_scale() {
     local program said
-    program=$(example plan_scale fathom-coordinator) || { miss "plan_scale does not build"; return 0; }
+    program=$(example plan_scale fathom-plan) || { miss "plan_scale does not build"; return 0; }
     said=$("$program" | paste -sd ';' | sed 's/;/; /g') || miss "a plan of 100,000 cameras passes its bounds"
     row synthetic plan_scale "$said"
 }
@@ -132,7 +132,7 @@ plan_scale() {
 # Two sizes, for the slope; 100 million (14 GB of disk) with `scripts/accept.sh merge_100_million`.
 merge_scale() {
     local program rows
-    program=$(example merge_scale fathom-coordinator) || { miss "merge_scale does not build"; return 0; }
+    program=$(example merge_scale fathom-merge) || { miss "merge_scale does not build"; return 0; }
     for rows in ${1:-10_000_000 30_000_000}; do
         "$program" "$rows" >"$out/merge-$rows.log" 2>&1 || miss "a merge of $rows Gaussians: $(tail -n 1 "$out/merge-$rows.log")"
         row "$rows" "merge_scale $rows" "$(paste -sd ';' "$out/merge-$rows.log" | sed 's/;/; /g')"

@@ -162,9 +162,14 @@ impl Process {
     }
 
     fn ended(&self, how: String) -> CliError {
-        let log = std::fs::read_to_string(&self.log).unwrap_or_default();
-        let last = log.lines().rev().find(|line| !line.trim().is_empty()).unwrap_or("its log is empty");
-        CliError::Message(format!("the {} {how}: {}; see {}", self.what, last.trim(), self.log.display()))
+        let log = std::fs::read(&self.log).map(|bytes| String::from_utf8_lossy(&bytes).into_owned());
+        let last = match &log {
+            Ok(log) => {
+                log.lines().rev().find(|line| !line.trim().is_empty()).unwrap_or("its log is empty").trim()
+            }
+            Err(error) => &format!("its log cannot be read ({error})"),
+        };
+        CliError::Message(format!("the {} {how}: {last}; see {}", self.what, self.log.display()))
     }
 }
 

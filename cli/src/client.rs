@@ -86,13 +86,13 @@ fn fault(url: String, action: &'static str, status: &Status) -> CliError {
 impl Client {
     /// Connects, and checks at once that a coordinator answers.
     pub async fn connect(dial: &Dial) -> Result<Self> {
-        let line = dial.now().await.map_err(|error| unreachable(dial, error))?;
+        let connection = dial.now().await.map_err(|error| unreachable(dial, error))?;
         Ok(Self {
             url: dial.url.clone(),
             dial: dial.clone(),
-            jobs: JobServiceClient::new(line.clone()).max_decoding_message_size(64 << 20),
-            uploads: UploadServiceClient::new(line.clone()).max_decoding_message_size(64 << 20),
-            admin: AdminServiceClient::new(line).max_decoding_message_size(64 << 20),
+            jobs: JobServiceClient::new(connection.clone()).max_decoding_message_size(64 << 20),
+            uploads: UploadServiceClient::new(connection.clone()).max_decoding_message_size(64 << 20),
+            admin: AdminServiceClient::new(connection).max_decoding_message_size(64 << 20),
         })
     }
 

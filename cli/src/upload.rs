@@ -171,11 +171,13 @@ pub async fn upload_dataset(
         request.list = Some(to_proto(&blob));
     }
     let begun = client.begin_upload(request).await?;
-    let id = begun.dataset.unwrap_or_default().dataset_id;
+    let Some(dataset) = begun.dataset else {
+        return Err(CliError::Message("the coordinator accepted the upload and named no dataset".to_owned()));
+    };
     if begun.missing_count > 0 {
         upload(client, files).await?;
     }
-    client.commit_dataset(&id).await
+    client.commit_dataset(&dataset.dataset_id).await
 }
 
 async fn upload(client: &Client, mut files: Vec<(BlobRef, Content)>) -> Result<()> {

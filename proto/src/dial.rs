@@ -529,13 +529,13 @@ mod tests {
         let Ok(address) = mute.local_addr() else { panic!("no address") };
         let answer_within = Duration::from_millis(200);
         let dial = Dial { answer_within, ..Dial::to(&address.to_string()) };
-        let Ok(line) = dial.lazily() else { panic!("no line") };
-        let mut jobs = crate::v1::job_service_client::JobServiceClient::new(line.clone());
+        let Ok(connection) = dial.lazily() else { panic!("no connection") };
+        let mut jobs = crate::v1::job_service_client::JobServiceClient::new(connection.clone());
         let Err(status) = jobs.list_jobs(ListJobsRequest::default()).await else { panic!("an answer") };
         // tonic's name for it.
         assert_eq!((status.code(), status.message()), (tonic::Code::Cancelled, "Timeout expired"));
 
-        let mut uploads = crate::v1::upload_service_client::UploadServiceClient::new(line);
+        let mut uploads = crate::v1::upload_service_client::UploadServiceClient::new(connection);
         let upload = uploads.write_blob(futures::stream::iter([WriteBlobRequest::default()]));
         let waited = tokio::time::timeout(answer_within * 5, upload).await;
         assert!(waited.is_err(), "an upload was given up: {waited:?}");

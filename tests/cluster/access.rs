@@ -42,7 +42,7 @@ async fn only_health_is_served_without_a_token() {
     let refused = is(Code::Unauthenticated, "TOKEN_REFUSED");
     assert_eq!(said(cluster.with(Some(&forged)).list().await), refused);
     assert_eq!(said(cluster.with(Some("nonsense")).list().await), refused);
-    let mut health = tonic_health::pb::health_client::HealthClient::new(stranger.line.clone());
+    let mut health = tonic_health::pb::health_client::HealthClient::new(stranger.connection.clone());
     let request = tonic_health::pb::HealthCheckRequest { service: "fathom.v1.JobService".into() };
     assert_eq!(health.check(request).await.unwrap().into_inner().status, 1);
     assert!(cluster.operator().list().await.unwrap().is_empty());

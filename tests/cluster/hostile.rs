@@ -272,7 +272,7 @@ async fn a_silent_upload_ends_and_lets_another_continue() {
 async fn unknown_methods_are_unimplemented_and_reflection_answers() {
     let cluster = GuardedCluster::start(|_, _| {}).await;
     let call = async |caller: &Caller, path: &'static str| {
-        let mut grpc = tonic::client::Grpc::new(caller.line.clone());
+        let mut grpc = tonic::client::Grpc::new(caller.connection.clone());
         grpc.ready().await.unwrap();
         let codec = tonic_prost::ProstCodec::<FindMissingBlobsRequest, FindMissingBlobsRequest>::default();
         let request = tonic::Request::new(FindMissingBlobsRequest::default());

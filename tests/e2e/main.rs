@@ -17,6 +17,9 @@ mod processes;
 mod render;
 #[cfg(unix)]
 mod several_machines;
+#[cfg(unix)]
+#[path = "../support/small_disk.rs"]
+mod small_disk;
 mod steer;
 mod store;
 #[cfg(unix)]

@@ -7,26 +7,13 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use crate::processes::{Service, fail, fathom, json, output_of, succeed, tiny_scene, under};
+use crate::small_disk::{SmallDisk, wait_for};
 
 /// Growth increment of sled's log.
 const SEGMENT_BYTES: u64 = 512 << 10;
-/// Much longer than any step here takes on two busy cores.
-const PATIENCE: Duration = Duration::from_secs(120);
-
-fn wait_for<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
-    let begin = Instant::now();
-    loop {
-        if let Some(found) = look() {
-            return found;
-        }
-        assert!(begin.elapsed() < PATIENCE, "waited {PATIENCE:?} in vain for {what}");
-        std::thread::sleep(Duration::from_millis(10));
-    }
-}
-
 /// Every file under a folder with its content and mode.
 fn files_under(folder: &Path) -> BTreeMap<PathBuf, (Vec<u8>, u32)> {
     let mut files = BTreeMap::new();
@@ -44,38 +31,6 @@ fn files_under(folder: &Path) -> BTreeMap<PathBuf, (Vec<u8>, u32)> {
         }
     }
     files
-}
-
-/// A small file system in memory; gone when this is dropped.
-struct SmallDisk(PathBuf);
-
-impl SmallDisk {
-    /// `None` if this user may not mount one.
-    fn mounted(at: &Path, bytes: u64) -> Option<Self> {
-        std::fs::create_dir_all(at).expect("a folder");
-        Self::mount(&["-t", "tmpfs", "-o", &format!("size={bytes}"), "none"], at).then(|| Self(at.to_owned()))
-    }
-
-    fn mount(words: &[&str], at: &Path) -> bool {
-        let status = Command::new("mount").args(words).arg(at).stderr(Stdio::null()).status();
-        status.is_ok_and(|status| status.success())
-    }
-
-    /// Writes until the disk is full; returns the file that fills it.
-    fn fill(&self) -> PathBuf {
-        let ballast = self.0.join("ballast");
-        let mut file = std::fs::File::create(&ballast).expect("a file");
-        let written = std::io::copy(&mut std::io::repeat(1), &mut file);
-        assert!(written.is_err_and(|error| error.kind() == std::io::ErrorKind::StorageFull));
-        ballast
-    }
-}
-
-impl Drop for SmallDisk {
-    fn drop(&mut self) {
-        // Otherwise it disappears with the machine's memory.
-        let _ = Command::new("umount").arg("-l").arg(&self.0).status();
-    }
 }
 
 /// A coordinator under test, and its output.
@@ -290,7 +245,7 @@ fn verify_export_and_token_list_never_write_the_data_dir() {
             fail(&["store", "verify", "--data-dir", &data, "--scratch", &disk.0.to_string_lossy()]);
         assert!(error.contains("--scratch DIR"), "{error}");
         std::fs::remove_file(ballast).expect("room");
-        assert!(SmallDisk::mount(&["-o", "remount,ro"], &disk.0), "it was mounted before");
+        disk.make_read_only();
         look("on a read-only disk");
     }
     let scratch = under(folder.path(), "scratch");

@@ -3,10 +3,11 @@
 use std::path::Path;
 
 use crate::harness::{Harness, flip_a_bit};
-use crate::process::{Process, wait_for};
+use crate::process::Process;
 use crate::processes::can_train;
 use crate::reference::{self, scene};
 use crate::slow_link::SlowLink;
+use crate::small_disk::wait_for;
 
 /// Bytes after the end of a photograph, ignored by decoders: more than two messages of an upload.
 const PADDING: usize = 3 << 20;

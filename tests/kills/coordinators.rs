@@ -3,9 +3,9 @@
 use std::time::Duration;
 
 use crate::harness::Harness;
-use crate::process::wait_for;
 use crate::processes::can_train;
 use crate::reference::scene;
+use crate::small_disk::wait_for;
 
 #[test]
 fn a_coordinator_killed_during_planning_plans_again() {

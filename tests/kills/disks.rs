@@ -1,11 +1,11 @@
 //! Full disks, and flipped bits on the coordinator's disk.
 
 use std::path::{Path, PathBuf};
-use std::process::Command;
 
 use crate::harness::{Harness, Rules, flip_a_bit};
-use crate::process::{Process, wait_for};
+use crate::process::Process;
 use crate::processes::can_train;
+use crate::small_disk::{SmallDisk, wait_for};
 
 #[test]
 fn a_full_disk_refuses_new_jobs_and_the_running_one_continues() {
@@ -37,27 +37,6 @@ fn a_full_disk_refuses_new_jobs_and_the_running_one_continues() {
     harness.conclude(&job);
 }
 
-/// A small file system in memory; gone when this is dropped.
-struct SmallDisk(PathBuf);
-
-impl SmallDisk {
-    /// `None` if this user may not mount one.
-    fn mounted(at: &Path, bytes: u64) -> Option<Self> {
-        std::fs::create_dir_all(at).expect("a folder");
-        let size = format!("size={bytes}");
-        let mut mount = Command::new("mount");
-        mount.args(["-t", "tmpfs", "-o", &size, "none"]).arg(at).stderr(std::process::Stdio::null());
-        mount.status().is_ok_and(|status| status.success()).then(|| Self(at.to_owned()))
-    }
-}
-
-impl Drop for SmallDisk {
-    fn drop(&mut self) {
-        // Processes that are about to be killed may still have files open there.
-        let _ = Command::new("umount").arg("-l").arg(&self.0).status();
-    }
-}
-
 #[test]
 fn a_disk_full_to_the_last_byte_loses_nothing() {
     let scenario = "a_disk_full_to_the_last_byte_loses_nothing";
@@ -65,7 +44,7 @@ fn a_disk_full_to_the_last_byte_loses_nothing() {
         return;
     }
     let mut harness = Harness::stopped(scenario, Rules::default());
-    let Some(_disk) = SmallDisk::mounted(&harness.data, 32 << 20) else {
+    let Some(disk) = SmallDisk::mounted(&harness.data, 32 << 20) else {
         eprintln!("{scenario}: skipped, since nothing can be mounted here");
         return;
     };
@@ -73,11 +52,7 @@ fn a_disk_full_to_the_last_byte_loses_nothing() {
     harness.start_worker("first");
     let job = harness.submit();
     job.wait_for_checkpoint("partition-0000");
-    let ballast = harness.data.join("ballast");
-    let mut full = std::fs::File::create(&ballast).expect("a file");
-    // Writes until the disk is full.
-    let written = std::io::copy(&mut std::io::repeat(1), &mut full);
-    assert!(written.is_err_and(|error| error.kind() == std::io::ErrorKind::StorageFull));
+    let ballast = disk.fill();
     // It exits with a reason rather than acknowledge unsaved changes. Acknowledged changes must survive.
     let (url, logs) = (harness.url(), harness.path("logs"));
     let (mut priority, mut acknowledged) = (0, 0);

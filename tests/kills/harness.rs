@@ -9,9 +9,10 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 use serde_json::Value;
 
 use crate::history::{Acknowledged, History};
-use crate::process::{Process, Random, wait_for};
+use crate::process::{Process, Random};
 use crate::processes::{free_port, output_of, under};
 use crate::reference;
+use crate::small_disk::wait_for;
 
 /// Number of lines of each log shown on a failure.
 const LAST_LINES: usize = 14;

@@ -21,5 +21,7 @@ mod history;
 mod process;
 mod reference;
 mod slow_link;
+#[path = "../support/small_disk.rs"]
+mod small_disk;
 mod soak;
 mod workers;

@@ -4,24 +4,10 @@ use std::fs::File;
 use std::io::{BufRead as _, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdin, Command, ExitStatus, Stdio};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use crate::processes::fathom;
-
-/// Much longer than any step of a scenario takes on two busy cores.
-pub const PATIENCE: Duration = Duration::from_secs(150);
-
-/// Polls `look` until it returns a value.
-pub fn wait_for<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
-    let begin = Instant::now();
-    loop {
-        if let Some(found) = look() {
-            return found;
-        }
-        assert!(begin.elapsed() < PATIENCE, "waited {PATIENCE:?} in vain for {what}");
-        std::thread::sleep(Duration::from_millis(5));
-    }
-}
+use crate::small_disk::wait_for;
 
 /// `fathom` with its log in a file; killed when this is dropped, and when the test itself is killed.
 pub struct Process {

@@ -5,9 +5,9 @@ use std::time::{Duration, Instant};
 
 use crate::harness::{Harness, Rules, files_in};
 use crate::history::{History, Leased};
-use crate::process::wait_for;
 use crate::processes::can_train;
 use crate::slow_link::SlowLink;
+use crate::small_disk::wait_for;
 
 /// As in the jobs of the scenarios (`reference::JOB`).
 const CHECKPOINT_EVERY: Duration = Duration::from_secs(1);

@@ -24,7 +24,7 @@ pub struct GuardedCluster {
 
 /// A caller with its credentials.
 pub struct Caller {
-    pub line: Connection,
+    pub connection: Connection,
 }
 
 impl GuardedCluster {
@@ -48,7 +48,7 @@ impl GuardedCluster {
 
     pub fn with(&self, token: Option<&str>) -> Caller {
         let dial = Dial { token: token.map(Secret::new), ..Dial::to(&self.coordinator.url()) };
-        Caller { line: dial.lazily().unwrap() }
+        Caller { connection: dial.lazily().unwrap() }
     }
 
     pub fn operator(&self) -> Caller {
@@ -85,19 +85,19 @@ impl GuardedCluster {
 
 impl Caller {
     pub fn jobs(&self) -> JobServiceClient<Connection> {
-        JobServiceClient::new(self.line.clone())
+        JobServiceClient::new(self.connection.clone())
     }
 
     pub fn uploads(&self) -> UploadServiceClient<Connection> {
-        UploadServiceClient::new(self.line.clone())
+        UploadServiceClient::new(self.connection.clone())
     }
 
     pub fn admin(&self) -> AdminServiceClient<Connection> {
-        AdminServiceClient::new(self.line.clone())
+        AdminServiceClient::new(self.connection.clone())
     }
 
     pub fn workers(&self) -> WorkerServiceClient<Connection> {
-        WorkerServiceClient::new(self.line.clone())
+        WorkerServiceClient::new(self.connection.clone())
     }
 
     pub async fn upload(&self, content: &[u8]) -> Result<BlobRef, Status> {

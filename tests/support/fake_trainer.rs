@@ -140,7 +140,7 @@ impl FakeTrainer {
             }
         }
         if task.stage == v1::Stage::FirstPart {
-            let result = refined(task, control.upload(Bytes::copy_from_slice(&state))?);
+            let result = first_part_result(task, control.upload(Bytes::copy_from_slice(&state))?);
             return Ok(TaskOutput {
                 result,
                 gaussians: POINTS as u32,
@@ -255,11 +255,11 @@ pub fn found_water(partition: u32) -> Water {
 }
 
 /// Evidence for `beta_d` alone.
-fn refined(task: &TaskInput, state: BlobRef) -> Bytes {
+fn first_part_result(task: &TaskInput, state: BlobRef) -> Bytes {
     let partition = task.partition().unwrap().index;
     let Water { beta_d, beta_b, b_inf } = found_water(partition);
     let weight = f64::from(partition + 1);
-    let refined = worker_v1::Refined {
+    let result = worker_v1::FirstPartResult {
         format: 1,
         partition,
         state: Some(to_proto(&state)),
@@ -270,7 +270,7 @@ fn refined(task: &TaskInput, state: BlobRef) -> Bytes {
         unit: 1.0,
         rows: None,
     };
-    refined.encode_to_vec().into()
+    result.encode_to_vec().into()
 }
 
 /// The merged model, whose Gaussians in the band have opacities that follow from `state`.

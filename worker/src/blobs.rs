@@ -85,8 +85,12 @@ pub struct BlobClient {
 
 impl BlobClient {
     /// Uses an existing connection, for the blobs of the caller's own tenant.
-    pub fn new(line: Connection) -> Self {
-        Self { client: UploadServiceClient::new(line), job_id: String::new(), trouble: Trouble::default() }
+    pub fn new(connection: Connection) -> Self {
+        Self {
+            client: UploadServiceClient::new(connection),
+            job_id: String::new(),
+            trouble: Trouble::default(),
+        }
     }
 
     /// For the blobs of the tenant that a job belongs to.

@@ -75,9 +75,9 @@ impl Fetch<'_> {
         }
         let state = match inputs.get(&v1::Artifact::FirstPart) {
             Some(path) => {
-                let refined = v1::Refined::decode(self.read_file(path).await?)
+                let first_part = v1::FirstPartResult::decode(self.read_file(path).await?)
                     .map_err(|e| TaskError::protocol(format!("a first part that cannot be read: {e}")))?;
-                self.fetch_some(&refined.state).await?
+                self.fetch_some(&first_part.state).await?
             }
             None => None,
         };

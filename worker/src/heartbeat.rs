@@ -196,7 +196,7 @@ async fn beat(
     mut ended: watch::Receiver<()>,
 ) {
     let client = match coordinator.lazily() {
-        Ok(line) => WorkerServiceClient::new(line),
+        Ok(connection) => WorkerServiceClient::new(connection),
         Err(error) => {
             tracing::error!(%error, "the heartbeat cannot start");
             return;

@@ -77,7 +77,7 @@ impl Session {
         metrics: Arc<GpuMetrics>,
         stopping: watch::Receiver<bool>,
     ) -> Result<Self, WorkerError> {
-        let line = config.coordinator.lazily()?;
+        let connection = config.coordinator.lazily()?;
         let registration = v1::RegisterRequest {
             worker_name: config.name,
             incarnation: Uuid::new_v4().to_string(),
@@ -89,13 +89,13 @@ impl Session {
         let pulse = Arc::new(Pulse::default());
         let coordinator = config.coordinator;
         let heartbeat = Heartbeat::start(coordinator.clone(), registration.clone(), Arc::clone(&pulse))?;
-        let client = WorkerServiceClient::new(line.clone());
+        let client = WorkerServiceClient::new(connection.clone());
         Ok(Self {
             coordinator,
             logs: Shipper::start(client.clone()),
             metrics,
             client,
-            blobs: BlobClient::new(line),
+            blobs: BlobClient::new(connection),
             cache,
             executor,
             registration,

@@ -96,8 +96,17 @@ pub async fn run(args: DatasetArgs) -> Result<()> {
         What::Show(args) => {
             let client = args.which.service.client().await?;
             let dataset = client.dataset(&args.which.dataset).await?;
-            let root = dataset.root.clone().unwrap_or_default();
-            let list = if args.files { Some(client.read(&root).await?) } else { None };
+            let list = match &dataset.root {
+                Some(root) if args.files => Some(client.read(root).await?),
+                None if args.files => {
+                    let message = format!(
+                        "dataset {} is not committed, so it has no list of files",
+                        dataset.dataset_id
+                    );
+                    return Err(CliError::Message(message));
+                }
+                _ => None,
+            };
             let list = list.as_ref().map(|list| String::from_utf8_lossy(list));
             if args.json {
                 let mut value = dataset_json(&dataset);
@@ -111,7 +120,9 @@ pub async fn run(args: DatasetArgs) -> Result<()> {
                 return output::json(&value);
             }
             output::line(dataset_line(&dataset));
-            output::line(format!("  root digest {}", root.digest));
+            if let Some(root) = &dataset.root {
+                output::line(format!("  root digest {}", root.digest));
+            }
             if let Some(list) = list {
                 output::lines(list);
             }

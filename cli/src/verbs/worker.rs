@@ -213,6 +213,36 @@ mod tests {
     }
 
     #[test]
+    fn every_setting_is_a_key_of_the_file_and_a_flag() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("worker.toml");
+        // (key and value in the file, the same as flags, another value as a flag)
+        let settings = [
+            ("name = 'a'", "--name=a", "--name=b"),
+            ("cache_dir = 'c'", "--cache-dir=c", "--cache-dir=d"),
+            ("cache_bytes = 1", "--cache-bytes=1", "--cache-bytes=2"),
+            ("image_cache_bytes = 3", "--image-cache-bytes=3", "--image-cache-bytes=4"),
+            ("metrics_listen = '127.0.0.1:1'", "--metrics-listen=127.0.0.1:1", "--metrics-listen=[::1]:2"),
+            ("gpu_memory_limit = 5", "--gpu-memory-limit=5", "--gpu-memory-limit=6"),
+            ("job_log_level = 'warn'", "--job-log-level=warn", "--job-log-level=off"),
+            ("gpu = 3", "--gpu=3", "--gpu=4"),
+            (
+                "coordinator = 'http://127.0.0.1:1'",
+                "--coordinator=http://127.0.0.1:1",
+                "--coordinator=http://[::1]:2",
+            ),
+        ];
+        let resolved = |words: &[&str]| format!("{:?}", resolve(words).unwrap());
+        for (in_file, same, other) in settings {
+            std::fs::write(&file, in_file).unwrap();
+            let file = ["--config", file.to_str().unwrap()];
+            assert_eq!(resolved(&file), resolved(&[same]), "{in_file}");
+            assert_ne!(resolved(&file), resolved(&[]), "{in_file} changes nothing");
+            assert_eq!(resolved(&[&file[..], &[other]].concat()), resolved(&[other]), "{other} does not win");
+        }
+    }
+
+    #[test]
     fn the_file_names_one_gpu_several_or_all() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("worker.toml");

@@ -130,7 +130,7 @@ fn fuzzed_indexes_of_artifacts_are_read_or_refused() {
 #[test]
 fn fuzzed_measurements_of_workers_are_taken_or_refused() {
     let three = vec![0.1; 3];
-    let refined = v1::Refined {
+    let first_part = v1::FirstPartResult {
         format: 1,
         partition: 3,
         beta_d: three.clone(),
@@ -148,17 +148,17 @@ fn fuzzed_measurements_of_workers_are_taken_or_refused() {
         0.5,
     );
     let read = |bytes: &[u8]| {
-        let Ok(refined) = v1::Refined::decode(bytes) else { return false };
-        let Ok(evidence) = exchange::evidence_of(3, &refined) else { return false };
+        let Ok(first_part) = v1::FirstPartResult::decode(bytes) else { return false };
+        let Ok(evidence) = exchange::evidence_of(3, &first_part) else { return false };
         let other = fathom_core::water::PartitionEvidence { partition: 4, ..evidence };
-        let Ok(found) = fathom_core::water::consensus(&coarse, refined.unit, &[evidence, other]) else {
+        let Ok(found) = fathom_core::water::consensus(&coarse, first_part.unit, &[evidence, other]) else {
             return false;
         };
         let json = serde_json::to_vec(&found).unwrap();
         assert_eq!(fathom_core::water::Consensus::from_json(&json).unwrap(), found);
         true
     };
-    run(&Target::new("Refined", vec![refined.encode_to_vec()], &read));
+    run(&Target::new("FirstPartResult", vec![first_part.encode_to_vec()], &read));
 
     let metrics = v1::ViewMetrics {
         name: "left/a.jpg".into(),

@@ -53,20 +53,29 @@ impl ArtifactIndex {
     }
 }
 
+fn unreadable(artifact: Artifact, blob: &BlobRef, error: &dyn std::error::Error) -> OwnTaskError {
+    OwnTaskError::failed(format!(
+        "the {} {} cannot be read: {error}; use workers of the coordinator's version",
+        artifact.title(),
+        blob.digest
+    ))
+}
+
 /// Writes the files of a job whose model is merged and evaluated.
 pub async fn assemble(objects: &BlobStore, view: &JobView) -> Result<TaskOutput, OwnTaskError> {
     let job = &view.job;
     let model = made(job, Artifact::Model)?.clone();
     let plan_json = made(job, Artifact::Plan)?.clone();
     let plan_png = made(job, Artifact::PlanPicture)?.clone();
-    let report: MergeReport = serde_json::from_slice(&objects.read(made(job, Artifact::MergeReport)?).await?)
-        .map_err(|e| OwnTaskError::failed(format!("merge report: {e}")))?;
+    let report = made(job, Artifact::MergeReport)?;
+    let report: MergeReport = serde_json::from_slice(&objects.read(report).await?)
+        .map_err(|e| unreadable(Artifact::MergeReport, report, &e))?;
     let input = JobInput::read(objects, job).await?;
     let plan = read_plan(objects, job).await?;
     let evaluation = match job.output(Artifact::Evaluation) {
         Some(blob) => Some(
             Evaluation::decode(objects.read_at_most(blob, MAX_EVALUATION_BYTES).await?)
-                .map_err(|e| OwnTaskError::failed(format!("evaluation: {e}")))?,
+                .map_err(|e| unreadable(Artifact::Evaluation, blob, &e))?,
         ),
         None => None,
     };

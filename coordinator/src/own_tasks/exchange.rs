@@ -11,7 +11,7 @@ use fathom_core::exchange::Exchange;
 use fathom_core::ply;
 use fathom_core::scene::BlobRef;
 use fathom_core::water::{Consensus, PartitionEvidence, Water, consensus, four_digits};
-use fathom_proto::worker::v1::Refined;
+use fathom_proto::worker::v1::FirstPartResult;
 use prost::Message;
 
 use super::OwnTaskError;
@@ -20,16 +20,16 @@ use crate::objects::BlobStore;
 use crate::schedule::{Artifact, Stage, TaskId, TaskOutput, TaskState, TaskStats};
 use crate::store::JobView;
 
-/// The layout of [`Refined`] that this program reads.
+/// The layout of [`FirstPartResult`] that this program reads.
 const FORMAT: u32 = 1;
 
-/// Longest [`Refined`], bytes: some thirty numbers and a reference.
-pub const MAX_REFINED_BYTES: u64 = 64 << 10;
+/// Longest [`FirstPartResult`], bytes: some thirty numbers and a reference.
+pub const MAX_FIRST_PART_BYTES: u64 = 64 << 10;
 
 /// Computes the input of the second parts, once all first parts are done.
 pub async fn find(objects: &BlobStore, view: &JobView) -> Result<TaskOutput, OwnTaskError> {
     let config = config_of(&view.job)?;
-    let mut said = Vec::new();
+    let mut results = Vec::new();
     let mut rows = BTreeMap::new();
     for (task, _) in &view.tasks {
         let TaskId { stage, partition } = task.task;
@@ -38,21 +38,21 @@ pub async fn find(objects: &BlobStore, view: &JobView) -> Result<TaskOutput, Own
         else {
             continue;
         };
-        let refined = Refined::decode(objects.read_at_most(result, MAX_REFINED_BYTES).await?)
+        let first_part = FirstPartResult::decode(objects.read_at_most(result, MAX_FIRST_PART_BYTES).await?)
             .map_err(|e| OwnTaskError::failed(format!("the result of {}: {e}", task.task)))?;
-        check_refined(partition, &refined)?;
+        check_first_part(partition, &first_part)?;
         // Detected now, not later by a worker that resumes from it.
-        for blob in [&refined.state, &refined.rows].into_iter().flatten() {
+        for blob in [&first_part.state, &first_part.rows].into_iter().flatten() {
             objects.require(&of_message(blob)).await?;
         }
-        rows.extend(refined.rows.as_ref().map(|blob| (partition, of_message(blob))));
-        said.push((partition, refined));
+        rows.extend(first_part.rows.as_ref().map(|blob| (partition, of_message(blob))));
+        results.push((partition, first_part));
     }
-    let water = match config.water.is_joint_for(said.len() as u32) {
-        true => Some(water_of(objects, view, &said).await?),
+    let water = match config.water.is_joint_for(results.len() as u32) {
+        true => Some(water_of(objects, view, &results).await?),
         false => None,
     };
-    tracing::info!(job = %view.job.job_id, partitions = said.len(), cells = rows.len(), "exchanged the results of the first parts");
+    tracing::info!(job = %view.job.job_id, partitions = results.len(), cells = rows.len(), "exchanged the results of the first parts");
     let json = serde_json::to_vec(&Exchange::new(water, rows));
     let json = json.map_err(|e| OwnTaskError::failed(e.to_string()))?;
     Ok(TaskOutput::of(Stage::Exchange, objects.put(json.into()).await?, TaskStats::default()))
@@ -62,13 +62,13 @@ pub async fn find(objects: &BlobStore, view: &JobView) -> Result<TaskOutput, Own
 async fn water_of(
     objects: &BlobStore,
     view: &JobView,
-    refined: &[(u32, Refined)],
+    results: &[(u32, FirstPartResult)],
 ) -> Result<Consensus, OwnTaskError> {
-    let mut said = Vec::new();
+    let mut found = Vec::new();
     let mut unit = None;
-    for (partition, refined) in refined {
-        said.push(evidence_of(*partition, refined)?);
-        if *unit.get_or_insert(refined.unit) != refined.unit {
+    for (partition, result) in results {
+        found.push(evidence_of(*partition, result)?);
+        if *unit.get_or_insert(result.unit) != result.unit {
             return Err(OwnTaskError::failed(format!(
                 "the result of {} uses a different unit from those before it; use workers of one version",
                 Stage::FirstPart.task_of(*partition)
@@ -81,7 +81,7 @@ async fn water_of(
     let (Some(coarse), Some(unit)) = (coarse, unit) else {
         return Err(OwnTaskError::failed("the coarse model or its partitions have no water".into()));
     };
-    let found = consensus(&coarse, unit, &said).map_err(|e| OwnTaskError::failed(e.to_string()))?;
+    let found = consensus(&coarse, unit, &found).map_err(|e| OwnTaskError::failed(e.to_string()))?;
     log(view, &coarse.water(), &found);
     Ok(found)
 }
@@ -95,19 +95,19 @@ fn fault_of(partition: u32, why: &str) -> OwnTaskError {
 }
 
 /// Refuses a result that does not belong to its task.
-fn check_refined(partition: u32, refined: &Refined) -> Result<(), OwnTaskError> {
-    let Refined { format, partition: said, .. } = refined;
-    if (*format, *said) == (FORMAT, partition) {
+fn check_first_part(partition: u32, result: &FirstPartResult) -> Result<(), OwnTaskError> {
+    let FirstPartResult { format, partition: named, .. } = result;
+    if (*format, *named) == (FORMAT, partition) {
         return Ok(());
     }
-    Err(fault_of(partition, &format!("it has format {format} and belongs to partition {said}")))
+    Err(fault_of(partition, &format!("it has format {format} and belongs to partition {named}")))
 }
 
 /// The evidence of a first part, checked against its partition.
-pub fn evidence_of(partition: u32, refined: &Refined) -> Result<PartitionEvidence, OwnTaskError> {
-    check_refined(partition, refined)?;
+pub fn evidence_of(partition: u32, result: &FirstPartResult) -> Result<PartitionEvidence, OwnTaskError> {
+    check_first_part(partition, result)?;
     let refuse = |why: String| fault_of(partition, &why);
-    let Refined { beta_d, beta_b, b_inf, evidence, unit, .. } = refined;
+    let FirstPartResult { beta_d, beta_b, b_inf, evidence, unit, .. } = result;
     if !(unit.is_finite() && *unit > 0.0) {
         return Err(refuse(format!("its unit is {unit}")));
     }
@@ -152,7 +152,7 @@ mod tests {
     #[test]
     fn a_result_of_another_partition_or_incomplete_is_refused() {
         let three = vec![0.1; 3];
-        let sound = Refined {
+        let sound = FirstPartResult {
             format: 1,
             partition: 3,
             beta_d: three.clone(),
@@ -160,15 +160,15 @@ mod tests {
             b_inf: three,
             evidence: vec![2.0; 9],
             unit: 5.0,
-            ..Refined::default()
+            ..FirstPartResult::default()
         };
         let read = evidence_of(3, &sound);
         assert_eq!(read.map(|read| (read.partition, read.evidence)).ok(), Some((3, [2.0; 9])));
-        let refused = |partition: u32, refined: Refined| evidence_of(partition, &refined).is_err();
+        let refused = |partition: u32, result: FirstPartResult| evidence_of(partition, &result).is_err();
         assert!(refused(2, sound.clone()));
-        assert!(refused(3, Refined { format: 2, ..sound.clone() }));
-        assert!(refused(3, Refined { beta_b: vec![0.1; 2], ..sound.clone() }));
-        assert!(refused(3, Refined { evidence: Vec::new(), ..sound.clone() }));
-        assert!(refused(3, Refined { unit: f64::NAN, ..sound }));
+        assert!(refused(3, FirstPartResult { format: 2, ..sound.clone() }));
+        assert!(refused(3, FirstPartResult { beta_b: vec![0.1; 2], ..sound.clone() }));
+        assert!(refused(3, FirstPartResult { evidence: Vec::new(), ..sound.clone() }));
+        assert!(refused(3, FirstPartResult { unit: f64::NAN, ..sound }));
     }
 }

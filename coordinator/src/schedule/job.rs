@@ -142,11 +142,6 @@ pub struct JobRecord {
 }
 
 impl JobRecord {
-    /// Whether it has been planned.
-    pub fn is_planned(&self) -> bool {
-        self.outputs.contains_key(&Artifact::Plan)
-    }
-
     /// An artifact of one of its stages; `None` before it is made.
     pub fn output(&self, artifact: Artifact) -> Option<&BlobRef> {
         self.outputs.get(&artifact)

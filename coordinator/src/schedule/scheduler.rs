@@ -421,3 +421,38 @@ fn retry(rows: &mut JobRows, now_ms: u64, events: &mut Vec<EventBody>) {
     job.error.clear();
     events.push(EventBody::JobState { state: JobState::Running, message: "retried".to_owned() });
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::schedule::{Artifact, TaskStats};
+
+    fn blob() -> BlobRef {
+        BlobRef::of(b"x")
+    }
+
+    fn made(artifacts: &[Artifact], planned: bool) -> TaskOutput {
+        let made = artifacts.iter().map(|artifact| (*artifact, blob())).collect();
+        TaskOutput { made, stats: TaskStats::default(), planned: planned.then(Planned::default) }
+    }
+
+    #[test]
+    fn an_output_that_does_not_fit_its_stage_is_refused() {
+        use Artifact::{Evaluation, MergeReport, Model, Plan, PlanPicture};
+        for (stage, artifacts, planned, fits) in [
+            (Stage::Plan, &[Plan, PlanPicture][..], true, true),
+            (Stage::Plan, &[Plan, PlanPicture], false, false),
+            (Stage::Plan, &[Plan], true, false),
+            (Stage::Merge, &[Model, MergeReport], false, true),
+            (Stage::Merge, &[Model], false, false),
+            (Stage::Merge, &[Model, MergeReport], true, false),
+            (Stage::Evaluate, &[Evaluation], false, true),
+            (Stage::Evaluate, &[Evaluation, Model], false, false),
+            (Stage::Evaluate, &[Model], false, false),
+            (Stage::Evaluate, &[], false, false),
+        ] {
+            let result = result_of(stage.task(), &made(artifacts, planned));
+            assert_eq!(result.is_some(), fits, "{stage} with {artifacts:?}, planned: {planned}");
+        }
+    }
+}

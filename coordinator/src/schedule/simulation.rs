@@ -9,9 +9,9 @@
 //! These properties are checked after every event:
 //! - No task is done twice, or with another result than the first one submitted under a running lease.
 //! - Only running leases change anything, and a task has at most two.
-//! - Where the job has first parts (every other seed), partitions begin under a consensus, each from the
+//! - Where the job has first parts (every other seed), partitions begin after the exchange, each from the
 //!   result of its own first part.
-//! - The model is that of the merge until borders are refined, where they are (every fifth seed).
+//! - The model is that of the merge until borders are trained again, where they are (every fifth seed).
 //! - Fences rise, and attempts stay within budgets.
 //! - No task of a paused job is assigned, and no more at a time than the job's limit.
 //! - Events are numbered without a gap.
@@ -383,7 +383,7 @@ impl Simulation {
             }
         }
         if self.rows.job.shape.stages.contains(&Stage::Exchange) {
-            faults.extend(self.faults_of_consensus());
+            faults.extend(self.faults_of_exchange());
         }
         faults.extend(self.faults_of_the_model());
         let open = self.rows.job.shape.tasks_of(self.rows.job.stage);
@@ -399,20 +399,20 @@ impl Simulation {
     }
 
     /// Faults of the two tasks of a partition and the exchange between them.
-    fn faults_of_consensus(&self) -> Vec<String> {
+    fn faults_of_exchange(&self) -> Vec<String> {
         let mut faults = Vec::new();
-        let consensus = self.done.get(&Stage::Exchange.task());
-        if self.rows.job.output(Artifact::Exchange) != consensus {
+        let exchange = self.done.get(&Stage::Exchange.task());
+        if self.rows.job.output(Artifact::Exchange) != exchange {
             faults.push(format!(
-                "the job has the consensus {:?}, not {consensus:?}",
+                "the job has the exchange {:?}, not {exchange:?}",
                 self.rows.job.output(Artifact::Exchange)
             ));
         }
         for (task, record) in &self.rows.tasks {
             match (task.stage, task.partition) {
                 (Stage::Partition, Some(index)) => {
-                    if record.attempts > 0 && consensus.is_none() {
-                        faults.push(format!("{task} began before the consensus"));
+                    if record.attempts > 0 && exchange.is_none() {
+                        faults.push(format!("{task} began before the exchange"));
                     }
                     if record.inputs.get(&Artifact::FirstPart)
                         != self.done.get(&Stage::FirstPart.task_of(index))
@@ -424,7 +424,7 @@ impl Simulation {
                     let first =
                         (0..6).filter(|k| self.done.contains_key(&Stage::FirstPart.task_of(*k))).count();
                     if record.attempts > 0 && first != 6 {
-                        faults.push(format!("a consensus of {first} first parts"));
+                        faults.push(format!("an exchange of {first} first parts"));
                     }
                 }
                 _ => {}
@@ -436,20 +436,21 @@ impl Simulation {
     /// Faults of the model and of the tasks that use it.
     fn faults_of_the_model(&self) -> Vec<String> {
         let mut faults = Vec::new();
-        let [merged, refined] = [Stage::Merge.task(), Stage::Borders.task()].map(|task| self.done.get(&task));
-        if self.rows.job.output(Artifact::Model) != refined.or(merged) {
+        let [merged, bordered] =
+            [Stage::Merge.task(), Stage::Borders.task()].map(|task| self.done.get(&task));
+        if self.rows.job.output(Artifact::Model) != bordered.or(merged) {
             faults.push(format!("the model is {:?}", self.rows.job.output(Artifact::Model)));
         }
         let attempts = |task| self.rows.tasks.get(&task).map_or(0, |record| record.attempts);
         if attempts(Stage::Borders.task()) > 0 && merged.is_none() {
-            faults.push("borders of no model are refined".into());
+            faults.push("borders of no model are trained".into());
         }
-        let refines = self.rows.job.shape.stages.contains(&Stage::Borders);
-        if refines != self.rows.tasks.contains_key(&Stage::Borders.task()) {
-            faults.push(format!("a shape with borders: {refines}, and other tasks"));
+        let has_borders = self.rows.job.shape.stages.contains(&Stage::Borders);
+        if has_borders != self.rows.tasks.contains_key(&Stage::Borders.task()) {
+            faults.push(format!("a shape with borders: {has_borders}, and other tasks"));
         }
-        if attempts(Stage::Evaluate.task()) > 0 && refines && refined.is_none() {
-            faults.push("a model is measured whose borders are being refined".into());
+        if attempts(Stage::Evaluate.task()) > 0 && has_borders && bordered.is_none() {
+            faults.push("a model is measured whose borders are being trained".into());
         }
         faults
     }
@@ -471,7 +472,7 @@ impl Simulation {
 }
 
 fn output(task: TaskId, result: BlobRef, seed: u32) -> TaskOutput {
-    let (refines, borders) = (seed % 2 == 1, seed.is_multiple_of(5));
+    let (has_first_parts, borders) = (seed % 2 == 1, seed.is_multiple_of(5));
     match task.stage {
         Stage::Plan => {
             let own = |stage: Stage| (stage.task(), PlannedTask::default());
@@ -479,10 +480,10 @@ fn output(task: TaskId, result: BlobRef, seed: u32) -> TaskOutput {
             let mut tasks = BTreeMap::from([own(Stage::Merge), own(Stage::Artifacts)]);
             tasks.insert(Stage::Global.task(), planned("global"));
             tasks.insert(Stage::Evaluate.task(), PlannedTask::new(blob("evaluate".into()), 0));
-            tasks.extend(refines.then(|| own(Stage::Exchange)));
+            tasks.extend(has_first_parts.then(|| own(Stage::Exchange)));
             tasks.extend(borders.then(|| (Stage::Borders.task(), planned("borders"))));
             for k in 0..6 {
-                if refines {
+                if has_first_parts {
                     tasks.insert(Stage::FirstPart.task_of(k), planned(&format!("first of {k}")));
                 }
                 tasks.insert(Stage::Partition.task_of(k), planned(&format!("partition {k}")));
@@ -506,7 +507,7 @@ fn thousands_of_seeds_commit_each_task_once_by_a_live_lease() {
 }
 
 fn simulate(seeds: u32) {
-    let (mut stale, mut silent, mut succeeded, mut agreed, mut refined) = (0, 0, 0, 0, 0);
+    let (mut stale, mut silent, mut succeeded, mut exchanged, mut bordered) = (0, 0, 0, 0, 0);
     let (mut pauses, mut retries, mut rivals, mut ahead, mut lost) = (0, 0, 0, 0, 0);
     for seed in 0..seeds {
         let end = Simulation::new(seed, false).run();
@@ -518,8 +519,8 @@ fn simulate(seeds: u32) {
         rivals += end.rivals.0;
         lost += end.lost;
         ahead += end.rivals.1;
-        agreed += u32::from(end.rows.job.output(Artifact::Exchange).is_some());
-        refined += u32::from(end.done.contains_key(&Stage::Borders.task()));
+        exchanged += u32::from(end.rows.job.output(Artifact::Exchange).is_some());
+        bordered += u32::from(end.done.contains_key(&Stage::Borders.task()));
         succeeded += u32::from(end.rows.job.state == JobState::Succeeded);
         let tasks: BTreeSet<TaskId> = end.rows.tasks.keys().copied().collect();
         assert!(end.done.keys().all(|task| tasks.contains(task)), "seed {seed}");
@@ -535,8 +536,8 @@ fn simulate(seeds: u32) {
     );
     assert!(lost > seeds / 10, "only {lost} results were lost");
     assert!(pauses > seeds && retries > seeds / 10, "{pauses} pauses, {retries} retries");
-    assert!(agreed > seeds / 30 * 14, "only {agreed} of {seeds} jobs came to a consensus");
-    assert!(refined > seeds / 30 * 5, "only {refined} of {seeds} jobs refined their borders");
+    assert!(exchanged > seeds / 30 * 14, "only {exchanged} of {seeds} jobs exchanged results");
+    assert!(bordered > seeds / 30 * 5, "only {bordered} of {seeds} jobs trained their borders");
     assert!(succeeded > seeds / 30 * 29, "only {succeeded} of {seeds} jobs succeeded");
 }
 

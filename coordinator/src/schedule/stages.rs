@@ -267,11 +267,6 @@ impl fmt::Display for Stage {
 }
 
 impl Artifact {
-    /// Whether each partition has one of its own.
-    pub fn is_per_partition(self) -> bool {
-        STAGES.iter().any(|spec| spec.per_partition && spec.outputs.contains(&self))
-    }
-
     /// Whether it may name other blobs, as an evaluation names its images. Models and images name none.
     pub fn names_others(self) -> bool {
         !matches!(self, Self::PlanPicture | Self::CoarseModel | Self::PartitionModel | Self::Model)

@@ -267,12 +267,6 @@ impl TaskRecord {
         self.state = state;
     }
 
-    /// Whether `lease` was granted on it and is over. False for a lease newer than this row: a row read
-    /// before the lease was granted says nothing about it.
-    pub fn is_past(&self, lease: &Lease) -> bool {
-        self.fence >= lease.fence && !self.is_held_by(lease)
-    }
-
     /// Whether its state is final.
     pub fn is_final(&self) -> bool {
         matches!(self.state, TaskState::Done { .. } | TaskState::Dead | TaskState::Cancelled)

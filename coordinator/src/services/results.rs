@@ -3,13 +3,13 @@
 use bytes::Bytes;
 use fathom_core::scene::BlobRef;
 use fathom_proto::v1;
-use fathom_proto::worker::v1::{Evaluation, Refined};
+use fathom_proto::worker::v1::{Evaluation, FirstPartResult};
 use prost::Message;
 
 use super::{encode, turn_to_read};
 use crate::objects::BlobStore;
 use crate::own_tasks::artifacts::MAX_EVALUATION_BYTES;
-use crate::own_tasks::exchange::MAX_REFINED_BYTES;
+use crate::own_tasks::exchange::MAX_FIRST_PART_BYTES;
 use crate::schedule::Stage;
 use crate::service_error::ServiceError;
 
@@ -38,7 +38,7 @@ pub async fn check(objects: &BlobStore, stage: Stage, result: &BlobRef) -> Resul
     require(objects, result).await?;
     let longest = match stage {
         Stage::Evaluate => MAX_EVALUATION_BYTES,
-        Stage::FirstPart => MAX_REFINED_BYTES,
+        Stage::FirstPart => MAX_FIRST_PART_BYTES,
         _ => return Ok(()),
     };
     let _turn = turn_to_read(RESULT_TAKES * result.bytes).await;
@@ -58,8 +58,8 @@ fn named_in(stage: Stage, result: Bytes) -> Vec<v1::BlobRef> {
             views.into_iter().flat_map(|view| [view.side_by_side, view.border]).flatten().collect()
         }
         Stage::FirstPart => {
-            let refined = Refined::decode(result).unwrap_or_default();
-            [refined.state, refined.rows].into_iter().flatten().collect()
+            let first_part = FirstPartResult::decode(result).unwrap_or_default();
+            [first_part.state, first_part.rows].into_iter().flatten().collect()
         }
         _ => Vec::new(),
     }
@@ -85,9 +85,10 @@ mod tests {
         ];
         let evaluation = Bytes::from(Evaluation { views, ..Default::default() }.encode_to_vec());
         assert_eq!(named_in(Stage::Evaluate, evaluation.clone()), [side, border]);
-        let refined = Refined { state: Some(state.clone()), rows: Some(rows.clone()), ..Default::default() };
-        assert_eq!(named_in(Stage::FirstPart, refined.encode_to_vec().into()), [state, rows]);
-        assert_eq!(named_in(Stage::FirstPart, Refined::default().encode_to_vec().into()), []);
+        let first_part =
+            FirstPartResult { state: Some(state.clone()), rows: Some(rows.clone()), ..Default::default() };
+        assert_eq!(named_in(Stage::FirstPart, first_part.encode_to_vec().into()), [state, rows]);
+        assert_eq!(named_in(Stage::FirstPart, FirstPartResult::default().encode_to_vec().into()), []);
         assert_eq!(named_in(Stage::Partition, evaluation), [], "a model names nothing");
         assert_eq!(named_in(Stage::Evaluate, Bytes::from_static(b"\xff")), []);
     }

@@ -313,7 +313,10 @@ fn a_picture_over_the_pixel_limit_is_refused_by_its_header() {
     let mask = png_header(65_532, 65_532);
     let photograph = file(rgb_test_picture(16, 16), ImageFormat::Png);
     let message = prepare_at(&photograph, Some(&mask), &pinhole(16, 16), 1600).unwrap_err().to_string();
-    assert!(message.contains("mask of dive/one.png") && message.contains("the limit is 268 million"), "{message}");
+    assert!(
+        message.contains("mask of dive/one.png") && message.contains("the limit is 268 million"),
+        "{message}"
+    );
 }
 
 #[test]

@@ -185,9 +185,7 @@ fn parse_float(word: &str) -> Result<f64, String> {
     }
     match word.parse() {
         Ok(value) => Ok(value),
-        Err(_) if word.is_empty() => {
-            Err("the line ends before a number; the file is truncated".to_owned())
-        }
+        Err(_) if word.is_empty() => Err("the line ends before a number; the file is truncated".to_owned()),
         Err(_) => Err(format!("\"{word}\" is not a number")),
     }
 }

@@ -8,7 +8,7 @@ use fathom_core::ply;
 use fathom_core::scene::{BlobRef, Points};
 use fathom_core::water::{StandardErrors, Water, WaterRecord};
 use fathom_proto::worker::v1::task_spec::Work;
-use fathom_proto::worker::v1::{Artifact, FailClass, Refined};
+use fathom_proto::worker::v1::{Artifact, FailClass, FirstPartResult};
 use fathom_worker::blobs::to_proto;
 use fathom_worker::execute::{TaskError, TaskInput};
 use glam::{DQuat, DVec3};
@@ -64,11 +64,11 @@ fn water_comment(task: &TaskInput) -> Result<Vec<String>, TaskError> {
 
 /// Result of a first part: the higher the partition's number, the murkier its water and the stronger its
 /// evidence.
-pub fn refined(task: &TaskInput, state: &BlobRef) -> Bytes {
+pub fn first_part_result(task: &TaskInput, state: &BlobRef) -> Bytes {
     let partition = task.partition().map_or(0, |spec| spec.index);
     let weight = f64::from(partition + 1);
     let Water { beta_d, beta_b, b_inf } = Water::COASTAL;
-    let refined = Refined {
+    let result = FirstPartResult {
         format: 1,
         partition,
         state: Some(to_proto(state)),
@@ -79,7 +79,7 @@ pub fn refined(task: &TaskInput, state: &BlobRef) -> Bytes {
         unit: 1.0,
         rows: None,
     };
-    refined.encode_to_vec().into()
+    result.encode_to_vec().into()
 }
 
 /// Result of border training: the merged model with other opacities in the band.

@@ -88,7 +88,7 @@ impl Trainer {
         }
         if task.stage == Stage::FirstPart {
             let state = control.uploading(Bytes::copy_from_slice(&state)).await?;
-            return Ok(output((results::refined(task, &state), 1), resumed_from));
+            return Ok(output((results::first_part_result(task, &state), 1), resumed_from));
         }
         if task.stage == Stage::Borders {
             return Ok(output(results::with_borders(task, &state)?, resumed_from));

@@ -56,11 +56,11 @@ pub fn run(
     let span = Span::of(&task.common);
     let resumed_from = span.done(trainer.progress().iteration);
     advance(&mut trainer, &config, span, task.held_out()?.as_ref(), control)?;
-    let refined = trainer.gaussians()?;
+    let trained = trainer.gaussians()?;
     // Free the device while the model is written and uploaded.
     drop(trainer);
     let mut bytes = read(path)?;
-    ply::replace_rows(&mut bytes, &path.display().to_string(), &band, &refined)?;
+    ply::replace_rows(&mut bytes, &path.display().to_string(), &band, &trained)?;
     output_of(bytes, gaussians, resumed_from)
 }
 

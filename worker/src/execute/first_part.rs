@@ -18,7 +18,7 @@ use fathom_core::views::ViewSource;
 use fathom_core::water::{Water, four_digits};
 use fathom_core::{CoreError, ply};
 use fathom_proto::v1::BlobRef;
-use fathom_proto::worker::v1::{Artifact, FailClass, FocusBox, PartitionSpec, Refined};
+use fathom_proto::worker::v1::{Artifact, FailClass, FirstPartResult, FocusBox, PartitionSpec};
 use glam::DVec3;
 use prost::Message;
 
@@ -27,7 +27,7 @@ use super::training::{Parts, Span, advance, finish, go_on, open, output_of, trai
 use super::{Control, TaskError, TaskInput, TaskOutput};
 use crate::blobs::to_proto;
 
-/// Version of [`Refined`]'s layout.
+/// Version of [`FirstPartResult`]'s layout.
 const FORMAT: u32 = 1;
 
 pub fn run(
@@ -43,7 +43,7 @@ pub fn run(
         let coarse =
             if refines_water(task) { Some(own.parts.water.ok_or_else(no_water)?.water()) } else { None };
         let found = coarse.map(|water| (water, [0.0; 9]));
-        let result = refined(task, spec, None, None, found);
+        let result = first_part_result(task, spec, None, None, found);
         return Ok(TaskOutput { result, ..TaskOutput::default() });
     }
     let mut trainer = open(gpu, task, first_run(task, &own)?)?;
@@ -59,7 +59,7 @@ pub fn run(
     drop(trainer);
     let state = to_proto(&control.upload(state)?);
     let rows = rows.map(|rows| control.upload(rows)).transpose()?.map(|rows| to_proto(&rows));
-    let result = refined(task, spec, Some(state), rows, found);
+    let result = first_part_result(task, spec, Some(state), rows, found);
     Ok(TaskOutput { result, gaussians, resumed_from, held_out, further: Vec::new() })
 }
 
@@ -246,7 +246,7 @@ fn no_water() -> TaskError {
     TaskError::Failed { class: FailClass::Input, message }
 }
 
-fn refined(
+fn first_part_result(
     task: &TaskInput,
     spec: &PartitionSpec,
     state: Option<BlobRef>,
@@ -255,7 +255,7 @@ fn refined(
 ) -> Bytes {
     let numbers =
         |of: fn(&Water) -> [f64; 3]| found.as_ref().map_or(Vec::new(), |(water, _)| of(water).to_vec());
-    let refined = Refined {
+    let result = FirstPartResult {
         format: FORMAT,
         partition: spec.index,
         state,
@@ -266,7 +266,7 @@ fn refined(
         unit: task.unit(),
         rows,
     };
-    Bytes::from(refined.encode_to_vec())
+    Bytes::from(result.encode_to_vec())
 }
 
 /// The data exchanged by the job's partitions; `None` if their runs have one part.

@@ -10,7 +10,7 @@ use fathom_core::exchange::Exchange;
 use fathom_core::picture::encode_png;
 use fathom_core::scene::{Camera, CameraModel, ManifestView, Points, Pose};
 use fathom_core::water::{Consensus, WaterRecord};
-use fathom_proto::worker::v1::{FocusBox, Refined};
+use fathom_proto::worker::v1::{FirstPartResult, FocusBox};
 use glam::DVec3;
 use prost::Message;
 
@@ -295,7 +295,7 @@ fn a_global_stage_reads_its_water_from_photographs_of_full_size() {
 struct TwoTasks {
     dir: tempfile::TempDir,
     task: TaskInput,
-    refined: Refined,
+    result: FirstPartResult,
     state: Bytes,
 }
 
@@ -319,10 +319,10 @@ impl TwoTasks {
         let control = Keeps::new(None);
         let done = executor.execute(&task, &control).unwrap();
         assert_eq!(control.reported.lock().unwrap().last(), Some(&(14, 14)));
-        let refined = Refined::decode(done.result).unwrap();
+        let result = FirstPartResult::decode(done.result).unwrap();
         let state = control.uploaded.into_inner().unwrap().pop().unwrap();
-        assert_eq!(refined.state.as_ref().unwrap().digest, blake3::hash(&state).to_hex().as_str());
-        Self { dir, task, refined, state }
+        assert_eq!(result.state.as_ref().unwrap().digest, blake3::hash(&state).to_hex().as_str());
+        Self { dir, task, result, state }
     }
 
     fn put(dir: &Path, name: &str, bytes: &[u8]) -> PathBuf {
@@ -359,7 +359,7 @@ impl TwoTasks {
 fn a_first_part_trains_its_water_and_submits_the_evidence() {
     let Some(executor) = executor("the first part of a partition", None) else { return };
     let two = TwoTasks::new(&executor);
-    let Refined { format, partition, beta_d, evidence, unit, .. } = &two.refined;
+    let FirstPartResult { format, partition, beta_d, evidence, unit, .. } = &two.result;
     assert_eq!((*format, *partition, *unit), (1, 3, 1.0));
     assert_ne!(beta_d[..], two.coarse().beta_d, "the water did not move");
     assert!(evidence.len() == 9 && evidence.iter().all(|weight| *weight > 0.0), "{evidence:?}");
@@ -377,7 +377,7 @@ fn a_first_part_trains_its_water_and_submits_the_evidence() {
     let control = Keeps::new(None);
     let output = executor.execute(&again, &control).unwrap();
     assert_eq!(output.resumed_from, done);
-    assert_eq!(Refined::decode(output.result).unwrap(), two.refined);
+    assert_eq!(FirstPartResult::decode(output.result).unwrap(), two.result);
     assert!(control.uploaded.lock().unwrap()[0] == two.state, "another state");
 }
 
@@ -446,11 +446,11 @@ fn a_second_part_trains_its_cell_beside_its_neighbours() {
         let mut task = two.task.clone();
         task.config.water.partitions = water;
         let control = Keeps::new(None);
-        let refined = Refined::decode(executor.execute(&task, &control).unwrap().result).unwrap();
+        let result = FirstPartResult::decode(executor.execute(&task, &control).unwrap().result).unwrap();
         let [state, rows] = <[Bytes; 2]>::try_from(control.uploaded.into_inner().unwrap()).unwrap();
-        assert_eq!(refined.rows.as_ref().unwrap().digest, blake3::hash(&rows).to_hex().as_str());
+        assert_eq!(result.rows.as_ref().unwrap().digest, blake3::hash(&rows).to_hex().as_str());
         assert_eq!(
-            refined.beta_d.is_empty(),
+            result.beta_d.is_empty(),
             water == WaterPartitions::Frozen,
             "a partition that keeps the water reports nothing about it"
         );
@@ -515,7 +515,7 @@ fn a_partition_without_anything_to_train_follows_the_others() {
     let mut two = TwoTasks::new(&executor);
     two.task.partition_mut().focus.as_mut().unwrap().min_x = 1e6;
     let control = Keeps::new(None);
-    let first = Refined::decode(executor.execute(&two.task, &control).unwrap().result).unwrap();
+    let first = FirstPartResult::decode(executor.execute(&two.task, &control).unwrap().result).unwrap();
     assert_eq!((first.state, first.evidence), (None, vec![0.0; 9]));
     assert_eq!(first.beta_d[..], two.coarse().beta_d);
     assert!(control.uploaded.lock().unwrap().is_empty());

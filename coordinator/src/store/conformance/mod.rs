@@ -65,7 +65,7 @@ fn planned(partitions: usize) -> TaskOutput {
     planned_as(partitions, false)
 }
 
-fn planned_as(partitions: usize, refines: bool) -> TaskOutput {
+fn planned_as(partitions: usize, has_first_parts: bool) -> TaskOutput {
     let task = |name: String| PlannedTask::new(blob(&name), 100);
     let own = |stage: Stage| (stage.task(), PlannedTask::default());
     let mut tasks = BTreeMap::from([own(Stage::Merge), own(Stage::Artifacts)]);
@@ -73,9 +73,9 @@ fn planned_as(partitions: usize, refines: bool) -> TaskOutput {
     if partitions > 1 {
         tasks.insert(Stage::Global.task(), task("global".into()));
     }
-    tasks.extend(refines.then(|| own(Stage::Exchange)));
+    tasks.extend(has_first_parts.then(|| own(Stage::Exchange)));
     for index in 0..partitions {
-        if refines {
+        if has_first_parts {
             tasks.insert(Stage::FirstPart.task_of(index as u32), task(format!("first of {index}")));
         }
         tasks.insert(Stage::Partition.task_of(index as u32), task(format!("partition {index}")));
