@@ -45,7 +45,7 @@ fn need_and_stock(error: CoreError) -> (u64, u64) {
 }
 
 #[test]
-fn a_limit_that_was_not_meant_in_bytes_is_refused() {
+fn a_memory_limit_too_small_to_be_in_bytes_is_refused() {
     let options = GpuOptions { allow_cpu: true, memory_limit: Some(8), ..GpuOptions::default() };
     let error = Gpu::new(options).err().unwrap();
     assert!(matches!(&error, CoreError::Config(said) if said.contains("it is in bytes")), "{error:?}");
@@ -83,7 +83,7 @@ fn memory_is_counted_until_the_last_clone_is_dropped() {
 }
 
 #[test]
-fn a_run_that_is_over_gives_all_its_memory_back() {
+fn a_finished_run_releases_all_its_memory() {
     let Some(gpu) = device_for_test("the memory of a run that is over") else { return };
     gpu.release_unused().unwrap();
     let before = allocated(&gpu);
@@ -97,7 +97,7 @@ fn a_run_that_is_over_gives_all_its_memory_back() {
 }
 
 #[test]
-fn the_content_of_writes_waits_in_bounded_memory() {
+fn writes_are_staged_in_bounded_memory() {
     let Some(gpu) = device_for_test("the staging of writes") else { return };
     let content = vec![7_u32; 70 * MIB as usize / 4];
     let buffers = ["first", "second"].map(|label| gpu.buffer(label, 70 * MIB).unwrap());
@@ -113,7 +113,7 @@ fn the_content_of_writes_waits_in_bounded_memory() {
 }
 
 #[test]
-fn allocation_beyond_the_limit_is_a_typed_error_and_the_device_goes_on() {
+fn allocation_beyond_the_limit_fails_and_the_device_survives() {
     let limit = 100 * MIB;
     let Some(gpu) = limited_device_for_test("the limit of memory", Some(limit)) else { return };
     assert_eq!(gpu.memory().unwrap().limit_bytes, Some(limit));
@@ -153,7 +153,7 @@ fn allocation_beyond_the_limit_is_a_typed_error_and_the_device_goes_on() {
 }
 
 #[test]
-fn photographs_on_the_device_give_way_to_what_a_run_needs_and_change_no_byte() {
+fn cached_photographs_make_room_for_a_run_and_change_no_byte() {
     const SIZE: u32 = 256;
     const VIEWS: u64 = 12;
     let photographs = VIEWS * u64::from(4 * SIZE * SIZE);
@@ -176,7 +176,7 @@ fn photographs_on_the_device_give_way_to_what_a_run_needs_and_change_no_byte() {
 }
 
 #[test]
-fn memory_that_only_the_device_still_holds_is_not_missing() {
+fn memory_of_dropped_buffers_is_released_before_an_error() {
     let Some(gpu) = limited_device_for_test("memory that is given back late", Some(100 * MIB)) else {
         return;
     };
@@ -194,7 +194,7 @@ fn memory_that_only_the_device_still_holds_is_not_missing() {
 /// finds none.
 #[cfg(target_os = "linux")]
 #[test]
-fn a_driver_without_memory_is_a_typed_error_and_the_device_goes_on() {
+fn a_driver_without_memory_fails_and_the_device_survives() {
     const CHILD: &str = "FATHOM_TEST_LITTLE_MEMORY";
     if std::env::var_os(CHILD).is_some() {
         return without_memory(&device_for_test("a driver without memory").unwrap());
@@ -205,7 +205,7 @@ fn a_driver_without_memory_is_a_typed_error_and_the_device_goes_on() {
         return;
     }
     let tests = std::env::current_exe().unwrap();
-    let this = "a_driver_without_memory_is_a_typed_error_and_the_device_goes_on";
+    let this = "a_driver_without_memory_fails_and_the_device_survives";
     let output = std::process::Command::new("sh")
         .args(["-c", "ulimit -v 4194304 && exec \"$0\" --exact \"$1\" --nocapture"])
         .arg(tests)
@@ -303,7 +303,7 @@ fn a_lost_device_is_a_typed_error_whatever_is_asked_of_it_first() {
 }
 
 #[test]
-fn a_device_that_is_lost_in_the_middle_of_a_run_ends_it_with_an_error() {
+fn losing_the_device_ends_a_run_with_an_error() {
     let Some(gpu) = device_for_test("a device lost in a run") else { return };
     let mut trainer = Trainer::new(Arc::clone(&gpu), run(300)).unwrap();
     trainer.advance(1).unwrap();

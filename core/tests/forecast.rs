@@ -153,7 +153,7 @@ const CASES: [Case; 5] = {
 };
 
 #[test]
-fn the_forecast_is_within_15_percent_of_the_peak_over_five_sizes() {
+fn the_forecast_is_within_15_percent_of_five_measured_peaks() {
     for case in CASES {
         // A device each: what others left in its caches would count.
         let Some(gpu) = device_for_test("the forecast of memory") else { return };
@@ -178,7 +178,7 @@ fn the_forecast_is_within_15_percent_of_the_peak_over_five_sizes() {
 }
 
 #[test]
-fn the_sizes_are_those_of_the_buffers() {
+fn the_forecast_sizes_match_the_buffers() {
     for case in CASES {
         let Some(gpu) = device_for_test("the sizes of buffers") else { return };
         let mut trainer = Trainer::new(Arc::clone(&gpu), case.run()).unwrap();

@@ -76,7 +76,7 @@ fn photographs_with_their_model_are_read_for_training() {
 }
 
 #[test]
-fn a_first_photograph_of_each_scene_is_prepared_at_training_size() {
+fn the_first_photograph_of_each_scene_is_prepared_for_training() {
     for name in ["fox", "reef-clip", "sesa-wreck", "sceaux"] {
         let Some(path) = real_scene_for_test(name) else { continue };
         let scene = load(&path, Purpose::Train);
@@ -98,7 +98,7 @@ fn a_first_photograph_of_each_scene_is_prepared_at_training_size() {
 }
 
 #[test]
-fn the_binary_and_the_text_model_of_one_reconstruction_have_the_same_poses() {
+fn binary_and_text_models_of_one_scene_have_the_same_poses() {
     let Some(path) = real_scene_for_test("sceaux") else { return };
     let binary = load(&path, Purpose::Inspect);
     // The text model belongs to the photographs before undistortion: its one camera is larger and has radial
@@ -149,7 +149,7 @@ fn a_text_model_with_a_camera_for_each_image_is_read() {
 }
 
 #[test]
-fn thousands_of_poses_without_pictures_are_inspected_in_well_under_a_second() {
+fn thousands_of_poses_are_inspected_in_under_a_second() {
     for (name, views, points) in
         [("auv", 4736, true), ("kitti", 4541, false), ("street-cameras.json", 1499, false)]
     {
@@ -169,7 +169,7 @@ fn thousands_of_poses_without_pictures_are_inspected_in_well_under_a_second() {
 }
 
 #[test]
-fn a_model_by_another_program_is_read_and_written_back_to_the_same_numbers() {
+fn a_model_by_another_program_survives_a_round_trip() {
     let Some(path) = real_scene_for_test("splats/kacytran_iteration7000.ply") else { return };
     let model = ply::read_model(&path).unwrap();
     assert_eq!((model.len(), model.sh_degree), (9080, 3));
@@ -201,7 +201,7 @@ fn a_model_by_another_program_is_read_and_written_back_to_the_same_numbers() {
 }
 
 #[test]
-fn the_baselines_on_the_wreck_are_those_that_are_known() {
+fn the_baselines_on_the_wreck_have_their_known_psnr() {
     let Some(path) = real_scene_for_test("sesa-wreck") else { return };
     let scene = load(&path, Purpose::Train);
     let (mut flat, mut blurred, mut count) = (0.0, 0.0, 0.0);

@@ -55,7 +55,7 @@ fn alpha_where_black(gpu: &Arc<Gpu>, model: &Gaussians, photographs: &InMemory) 
 }
 
 #[test]
-fn what_is_black_becomes_opaque_over_random_colours_and_transparent_over_black() {
+fn black_walls_become_opaque_only_over_random_backgrounds() {
     let Some(gpu) = device() else { return };
     let photographs = photographs_of(&gpu, &wall(), 64, 48);
     let mut start = grey(&wall());
@@ -76,7 +76,7 @@ fn what_is_black_becomes_opaque_over_random_colours_and_transparent_over_black()
 }
 
 #[test]
-fn a_seed_decides_every_byte_over_random_colours_and_a_resumed_run_draws_the_same() {
+fn a_seed_decides_random_backgrounds_also_after_a_resume() {
     let Some(gpu) = device() else { return };
     let photographs = photographs(&gpu, 48, 36);
     let (whole, progress) = train(&gpu, run(&photographs, random(30)), &[30]);

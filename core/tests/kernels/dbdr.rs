@@ -115,7 +115,7 @@ fn gradients(pixels: u32, seed: u32) -> Vec<[f32; 4]> {
 }
 
 #[test]
-fn pictures_under_a_water_that_follows_from_range_and_their_gradients_are_those_of_the_twin() {
+fn pictures_and_gradients_with_dbdr_match_the_twin() {
     for gpu in layouts() {
         for (k, size) in [[1, 1], [33, 31], [32, 32], [75, 53]].into_iter().enumerate() {
             let (seed, pixels) = (400 + k as u32, size[0] * size[1]);
@@ -197,7 +197,7 @@ fn the_identity_is_the_water_without_a_refinement_to_the_bit() {
 }
 
 #[test]
-fn saturated_factors_stay_finite_and_a_gradient_that_is_not_moves_nothing() {
+fn saturated_factors_stay_finite_and_nan_gradients_move_nothing() {
     for gpu in layouts() {
         let (size, seed) = ([33, 31], 420);
         let v = gradients(size[0] * size[1], seed);
@@ -289,7 +289,7 @@ fn a_renderer_of_the_record_shows_what_the_trainer_compares() {
 }
 
 #[test]
-fn a_run_with_maps_depends_on_neither_interruptions_nor_lists_nor_bands() {
+fn interruptions_short_lists_and_bands_change_no_byte() {
     let Some(gpu) = device() else { return };
     let photographs = photographs(&gpu, 64, 48);
     let new = || watery(&photographs, config(30), by_pixel(DbdrMode::Maps));
@@ -300,7 +300,7 @@ fn a_run_with_maps_depends_on_neither_interruptions_nor_lists_nor_bands() {
 }
 
 #[test]
-fn maps_that_do_not_learn_change_no_byte_and_without_dbdr_the_prior_stays() {
+fn maps_at_rate_0_change_no_byte_and_no_dbdr_keeps_the_prior() {
     let Some(gpu) = device() else { return };
     let photographs = photographs(&gpu, 48, 36);
     let trained = |water: WaterConfig| {

@@ -16,7 +16,7 @@ fn block_of(gpu: &Gpu, model: &Gaussians, capacity: u32) -> Blocks {
 }
 
 #[test]
-fn statistics_are_opacity_mean_gradients_and_size_and_start_anew() {
+fn statistics_are_opacity_gradients_and_size_and_reset_sums() {
     let Some(gpu) = device() else { return };
     let mut model = samples::random(141, 200, 1);
     model.means[3][1] = f32::NAN;
@@ -58,7 +58,7 @@ fn statistics_are_opacity_mean_gradients_and_size_and_start_anew() {
 }
 
 #[test]
-fn a_split_keeps_the_place_and_the_variance_and_its_halves_start_anew() {
+fn a_split_keeps_place_and_variance_and_resets_its_halves() {
     let Some(gpu) = device() else { return };
     for degree in [0, 1, 3] {
         let model = samples::random(142, 100, degree);
@@ -164,7 +164,7 @@ fn normal_pair(a: u32, b: u32) -> [f64; 2] {
 }
 
 #[test]
-fn a_clone_is_a_copy_and_the_halves_of_a_classic_split_are_drawn_from_their_parent() {
+fn clones_are_copies_and_classic_halves_are_drawn_from_parents() {
     let Some(gpu) = device() else { return };
     let (seed, iteration) = (77, 1234);
     for degree in [0, 3] {
@@ -312,7 +312,7 @@ fn a_reset_lowers_opacities_and_forgets_their_moments_alone() {
 }
 
 #[test]
-fn a_gaussian_is_smoothed_by_the_finest_sampling_of_the_views_that_see_it() {
+fn the_finest_view_that_sees_a_gaussian_sets_its_smoothing() {
     let Some(gpu) = device() else { return };
     let model = samples::random(145, 300, 0);
     let blocks = block_of(&gpu, &model, 300);

@@ -9,7 +9,7 @@ use crate::device::device;
 use crate::trainer::{assert_same_model, config, mean_psnr, photographs, photographs_from, run, truth};
 
 #[test]
-fn measuring_gives_the_metrics_of_the_model_as_it_is_and_changes_no_byte() {
+fn measuring_reports_the_current_model_and_changes_no_byte() {
     let Some(gpu) = device() else { return };
     let photographs = photographs(&gpu, 48, 36);
     let held_out = photographs_from(&gpu, &truth(), 48, 36, &[-0.7, 0.1, 0.5]);
@@ -36,7 +36,7 @@ fn measuring_gives_the_metrics_of_the_model_as_it_is_and_changes_no_byte() {
 }
 
 #[test]
-fn how_often_is_measured_is_no_part_of_the_run() {
+fn the_measuring_interval_is_not_part_of_the_run() {
     let Some(gpu) = device() else { return };
     let photographs = photographs(&gpu, 32, 24);
     let mut trainer = Trainer::new(Arc::clone(&gpu), run(&photographs, config(20))).unwrap();

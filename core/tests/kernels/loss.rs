@@ -99,7 +99,7 @@ fn check_in(
 }
 
 #[test]
-fn loss_and_gradient_of_any_size_are_those_of_the_twin() {
+fn loss_and_gradient_of_any_size_match_the_twin() {
     for gpu in layouts() {
         // One loss for all, so that a small picture follows a large one and a long one a square one.
         let mut loss = Loss::new(&gpu).unwrap();
@@ -116,7 +116,7 @@ fn loss_and_gradient_of_any_size_are_those_of_the_twin() {
 }
 
 #[test]
-fn in_linear_light_the_photograph_is_decoded_and_the_render_is_not() {
+fn in_linear_light_only_the_photograph_is_decoded() {
     for gpu in layouts() {
         let mut loss = Loss::new(&gpu).unwrap().in_light(LossLight::Linear);
         for (width, height) in [(75, 53), (17, 1), (1, 33), (16, 16)] {
@@ -170,7 +170,7 @@ fn a_pixel_counts_only_where_its_mask_byte_is_255() {
 }
 
 #[test]
-fn what_a_masked_pixel_holds_changes_nothing() {
+fn the_value_of_a_masked_pixel_changes_nothing() {
     for gpu in layouts() {
         let mut loss = Loss::new(&gpu).unwrap();
         let truth = photograph(12, 40, 30, |i| (i % 5 == 0).then_some(0));

@@ -53,7 +53,7 @@ fn record_of(trainer: &Trainer) -> WaterRecord {
 }
 
 #[test]
-fn the_water_is_what_the_network_says_and_enters_a_cadence_later() {
+fn a_prediction_becomes_the_water_one_cadence_later() {
     let Some(gpu) = device() else { return };
     let photographs = photographs(&gpu, 64, 48);
     let mut trainer =
@@ -74,7 +74,7 @@ fn the_water_is_what_the_network_says_and_enters_a_cadence_later() {
 }
 
 #[test]
-fn a_run_with_a_network_depends_on_neither_timing_nor_interruptions_nor_lists_nor_bands() {
+fn timing_interruptions_lists_and_bands_change_no_byte() {
     let Some(gpu) = device() else { return };
     let photographs = photographs(&gpu, 64, 48);
     let [on_a_thread, _, at_once] = ways();
@@ -88,7 +88,7 @@ fn a_run_with_a_network_depends_on_neither_timing_nor_interruptions_nor_lists_no
 }
 
 #[test]
-fn the_end_of_its_part_makes_one_water_from_where_descent_begins_anew() {
+fn descent_starts_afresh_from_the_last_predicted_water() {
     let Some(gpu) = device() else { return };
     let photographs = photographs(&gpu, 64, 48);
     for (composed, network) in ways() {
@@ -126,7 +126,7 @@ fn the_end_of_its_part_makes_one_water_from_where_descent_begins_anew() {
 }
 
 #[test]
-fn gathered_gradients_are_the_sums_of_those_of_the_twin_over_the_sound_iterations() {
+fn gathered_gradients_are_the_twins_sums_over_sound_iterations() {
     let decay = 1e-3;
     for gpu in layouts() {
         let mut frame = Frame::new(&gpu, 1, 1, 1).unwrap();
@@ -206,7 +206,7 @@ fn gathered_gradients_are_the_sums_of_those_of_the_twin_over_the_sound_iteration
 }
 
 #[test]
-fn the_gradient_of_the_depth_map_moves_gaussians_and_only_where_it_is_asked_for() {
+fn the_depth_gradient_moves_gaussians_only_when_it_is_on() {
     let Some(gpu) = device() else { return };
     let photographs = photographs(&gpu, 64, 48);
     let means = |depth_gradient: bool| {
@@ -242,7 +242,7 @@ fn a_frozen_water_ignores_the_network() {
 }
 
 #[test]
-fn a_network_that_diverges_leaves_a_sound_water_whose_spread_nobody_knows() {
+fn a_diverged_network_leaves_a_sound_water_of_unknown_error() {
     let Some(gpu) = device() else { return };
     let photographs = photographs(&gpu, 48, 36);
     for (composed, network) in ways() {

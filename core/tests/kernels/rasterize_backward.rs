@@ -71,7 +71,7 @@ fn check(view: &View, v: &ImageGradients) -> (usize, usize) {
 }
 
 #[test]
-fn gradients_of_hard_scenes_are_those_of_the_twin() {
+fn gradients_of_hard_scenes_match_the_twin() {
     for gpu in layouts() {
         for scene in hard_scenes(61, 300, 0) {
             let view = View::render(&gpu, &scene);
@@ -86,7 +86,7 @@ fn gradients_of_hard_scenes_are_those_of_the_twin() {
 }
 
 #[test]
-fn gradients_of_odd_sizes_are_those_of_the_twin() {
+fn gradients_of_odd_sizes_match_the_twin() {
     for gpu in layouts() {
         for (width, height) in [(16, 16), (17, 1), (1, 33), (9, 7)] {
             let scene = Scene::new(&format!("{width}x{height}"), samples::random(63, 150, 0), width, height);

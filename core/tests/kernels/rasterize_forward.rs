@@ -42,7 +42,7 @@ fn check(view: &View) -> usize {
 }
 
 #[test]
-fn images_of_hard_scenes_are_those_of_the_twin() {
+fn images_of_hard_scenes_match_the_twin() {
     for gpu in layouts() {
         for scene in hard_scenes(51, 400, 1) {
             let edges = check(&View::render(&gpu, &scene));
@@ -54,7 +54,7 @@ fn images_of_hard_scenes_are_those_of_the_twin() {
 }
 
 #[test]
-fn images_of_odd_sizes_are_those_of_the_twin() {
+fn images_of_odd_sizes_match_the_twin() {
     for gpu in layouts() {
         for (width, height) in [(1, 1), (16, 16), (17, 1), (1, 33), (8, 8), (9, 7), (128, 96), (75, 53)] {
             let scene = Scene::new(&format!("{width}x{height}"), samples::random(52, 150, 0), width, height);

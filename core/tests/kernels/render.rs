@@ -57,7 +57,7 @@ fn a_picture_in_strips_is_the_picture_in_one_piece() {
 }
 
 #[test]
-fn a_picture_whose_lists_are_too_long_is_the_same_to_the_bit_in_bands() {
+fn a_picture_rendered_in_bands_is_the_same_to_the_bit() {
     for gpu in layouts() {
         for scene in hard_scenes(8, 300, 2) {
             let render = |limits: Option<ListLimits>| {
@@ -77,7 +77,7 @@ fn a_picture_whose_lists_are_too_long_is_the_same_to_the_bit_in_bands() {
 }
 
 #[test]
-fn normals_are_unit_in_the_cameras_frame_and_leave_the_colours_alone() {
+fn unit_normals_in_camera_axes_leave_the_colours_unchanged() {
     let camera = PinholeCamera { width: 75, height: 53, fx: 80.0, fy: 80.0, cx: 37.5, cy: 26.5 };
     let eye = DVec3::new(1.0, -2.0, 0.5);
     let pose = Pose::looking_at(eye, eye + DVec3::new(0.3, 0.2, 1.0), DVec3::Y);

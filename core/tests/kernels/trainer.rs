@@ -225,7 +225,7 @@ fn training_lowers_the_loss_and_raises_the_psnr() {
 }
 
 #[test]
-fn classic_density_control_lowers_the_loss_under_the_cap_and_removes_what_faded() {
+fn classic_density_control_lowers_the_loss_and_keeps_the_cap() {
     let Some(gpu) = device() else { return };
     let photographs = photographs(&gpu, 64, 48);
     let config = TrainConfig {
@@ -258,7 +258,7 @@ fn classic_density_control_lowers_the_loss_under_the_cap_and_removes_what_faded(
 }
 
 #[test]
-fn a_model_trained_with_the_filter_of_mip_splatting_is_best_rendered_with_it() {
+fn a_model_trained_with_the_mip_filter_renders_best_with_it() {
     let Some(gpu) = device() else { return };
     let photographs = photographs(&gpu, 64, 48);
     let config = TrainConfig { mip_filter: true, ..config(240) };
@@ -311,7 +311,7 @@ fn a_seed_decides_every_byte() {
 }
 
 #[test]
-fn a_photograph_that_cannot_be_read_once_loses_and_repeats_no_step() {
+fn a_failed_photograph_read_loses_and_repeats_no_step() {
     struct Flaky {
         photographs: InMemory,
         loads: AtomicU32,
@@ -445,7 +445,7 @@ fn bands_change_no_byte() {
 }
 
 #[test]
-fn a_tile_that_sees_more_than_a_list_holds_is_an_error_that_says_what_to_do() {
+fn a_tile_beyond_the_list_limit_is_an_error_with_advice() {
     let Some(gpu) = device() else { return };
     let photographs = photographs(&gpu, 32, 24);
     let mut trainer = Trainer::new(Arc::clone(&gpu), run(&photographs, config(10))).unwrap();

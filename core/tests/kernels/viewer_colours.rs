@@ -25,7 +25,7 @@ fn picture(
 }
 
 #[test]
-fn a_model_blended_in_linear_light_looks_the_same_in_viewers_with_other_colours_alone() {
+fn new_colours_alone_show_a_linear_model_in_srgb_viewers() {
     let Some(gpu) = device() else { return };
     let mut views = photographs(&gpu, 96, 72).views;
     let held_out = views.remove(2);

@@ -83,7 +83,7 @@ fn losses() -> Vec<LossRecord> {
 }
 
 #[test]
-fn psnr_is_that_of_scikit_image_and_torchmetrics() {
+fn psnr_matches_scikit_image_and_torchmetrics() {
     for case in pictures() {
         let (render, truth) = case.packed();
         assert_close(&case.name, &[psnr(&render, &truth)], &[case.psnr_db]);
@@ -91,7 +91,7 @@ fn psnr_is_that_of_scikit_image_and_torchmetrics() {
 }
 
 #[test]
-fn ssim_is_that_of_scikit_image_and_torchmetrics_up_to_the_border() {
+fn ssim_matches_scikit_image_and_torchmetrics_with_the_border() {
     for case in pictures() {
         let (render, truth) = case.packed();
         assert_close(&case.name, &[ssim(&render, &truth)], &[case.ssim]);
@@ -99,7 +99,7 @@ fn ssim_is_that_of_scikit_image_and_torchmetrics_up_to_the_border() {
 }
 
 #[test]
-fn the_ssim_map_of_the_loss_is_that_of_scikit_image_and_torchmetrics_at_every_pixel() {
+fn the_ssim_map_of_the_loss_matches_the_peers_at_every_pixel() {
     let mut maps = 0;
     for case in pictures() {
         let Some(theirs) = &case.ssim_map_red else { continue };
@@ -113,7 +113,7 @@ fn the_ssim_map_of_the_loss_is_that_of_scikit_image_and_torchmetrics_at_every_pi
 }
 
 #[test]
-fn the_loss_is_that_of_torchmetrics() {
+fn the_loss_matches_torchmetrics() {
     for case in losses() {
         let ours = case.ours();
         assert_close(&case.name, &[ours.l1, ours.ssim, ours.total], &[case.l1, case.ssim, case.total]);
@@ -121,7 +121,7 @@ fn the_loss_is_that_of_torchmetrics() {
 }
 
 #[test]
-fn the_gradient_of_the_loss_is_that_of_autograd_through_torchmetrics() {
+fn the_loss_gradient_matches_autograd_through_torchmetrics() {
     for case in losses() {
         assert_rows_close(&case.name, &case.ours().v_rgb, &case.v_rgb);
     }

@@ -40,7 +40,7 @@ fn by_degree() -> Vec<(usize, Vec<Case>)> {
 }
 
 #[test]
-fn colours_by_direction_are_gsplats_at_every_degree() {
+fn colours_by_direction_match_gsplat_at_every_degree() {
     for (degree, cases) in by_degree() {
         let ours: Vec<_> = cases.iter().map(|case| sh_colour(case.unit(), &case.coeffs)).collect();
         let theirs: Vec<_> = cases.iter().map(|case| case.rgb).collect();
@@ -50,7 +50,7 @@ fn colours_by_direction_are_gsplats_at_every_degree() {
 }
 
 #[test]
-fn gradients_of_sh_coefficients_are_gsplats_at_every_degree() {
+fn gradients_of_sh_coefficients_match_gsplat_at_every_degree() {
     for (degree, cases) in by_degree() {
         let (mut ours, mut theirs) = (Vec::new(), Vec::new());
         for case in &cases {
@@ -64,7 +64,7 @@ fn gradients_of_sh_coefficients_are_gsplats_at_every_degree() {
 }
 
 #[test]
-fn gradients_of_the_viewing_direction_are_gsplats_at_every_degree() {
+fn gradients_of_viewing_direction_match_gsplat_at_every_degree() {
     for (degree, cases) in by_degree() {
         let v_direction = |case: &Case| {
             let mut ignored = vec![[0.0; 3]; case.coeffs.len()];

@@ -159,7 +159,7 @@ fn single(values: &[Option<f64>]) -> Vec<Option<[f64; 1]>> {
 }
 
 #[test]
-fn the_scenes_show_every_edge_and_one_has_gsplats_own_cap_of_alpha() {
+fn scenes_show_every_edge_and_one_has_gsplats_cap_of_alpha() {
     type Count = (&'static str, fn(&Counts) -> u32);
     let cases = cases();
     for case in &cases {
@@ -181,7 +181,7 @@ fn the_scenes_show_every_edge_and_one_has_gsplats_own_cap_of_alpha() {
 }
 
 #[test]
-fn what_is_behind_too_near_or_transparent_is_culled_and_nothing_else() {
+fn only_gaussians_behind_too_near_or_transparent_are_culled() {
     for case in cases() {
         for (i, splat) in case.splats.iter().enumerate() {
             let drawn = case.theirs.splats.opacity[i].is_some_and(|opacity| opacity >= 1.0 / 255.0);
@@ -191,21 +191,21 @@ fn what_is_behind_too_near_or_transparent_is_culled_and_nothing_else() {
 }
 
 #[test]
-fn projected_centres_are_gsplats() {
+fn projected_centres_match_gsplat() {
     for case in cases() {
         case.assert_splats("centre", &case.theirs.splats.mean2d, |splat, _| splat.mean2d);
     }
 }
 
 #[test]
-fn conics_are_gsplats() {
+fn conics_match_gsplat() {
     for case in cases() {
         case.assert_splats("conic", &case.theirs.splats.conic, |splat, _| splat.conic);
     }
 }
 
 #[test]
-fn depths_and_ranges_are_gsplats() {
+fn depths_and_ranges_match_gsplat() {
     for case in cases() {
         case.assert_splats("depth", &single(&case.theirs.splats.depth), |splat, _| [splat.depth]);
         case.assert_splats("range", &single(&case.theirs.splats.range), |splat, _| [splat.range]);
@@ -213,7 +213,7 @@ fn depths_and_ranges_are_gsplats() {
 }
 
 #[test]
-fn opacities_and_colours_are_gsplats() {
+fn opacities_and_colours_match_gsplat() {
     for case in cases() {
         case.assert_splats("opacity", &single(&case.theirs.splats.opacity), |splat, _| [splat.opacity]);
         case.assert_splats("colour", &case.theirs.splats.rgb, |splat, _| splat.rgb);
@@ -221,14 +221,14 @@ fn opacities_and_colours_are_gsplats() {
 }
 
 #[test]
-fn rendered_colours_are_gsplats() {
+fn rendered_colours_match_gsplat() {
     for case in cases() {
         assert_rows_close(&case.what("colour"), &case.raster.rgb, &case.theirs.raster.rgb);
     }
 }
 
 #[test]
-fn rendered_alphas_and_ranges_are_gsplats() {
+fn rendered_alphas_and_ranges_match_gsplat() {
     for case in cases() {
         assert_close(&case.what("alpha"), &case.raster.alpha, &case.theirs.raster.alpha);
         assert_close(&case.what("range"), &case.raster.range, &case.theirs.raster.range);
@@ -236,7 +236,7 @@ fn rendered_alphas_and_ranges_are_gsplats() {
 }
 
 #[test]
-fn gradients_of_splats_are_those_of_autograd() {
+fn gradients_of_splats_match_autograd() {
     for case in cases() {
         let theirs = &case.theirs.v_splats;
         case.assert_splats("gradient of conic", &theirs.conic, |_, v| v.conic);
@@ -247,28 +247,28 @@ fn gradients_of_splats_are_those_of_autograd() {
 }
 
 #[test]
-fn gradients_of_projected_centres_are_those_of_autograd() {
+fn gradients_of_projected_centres_match_autograd() {
     for case in cases() {
         case.assert_splats("gradient of centre", &case.theirs.v_splats.mean2d, |_, v| v.mean2d);
     }
 }
 
 #[test]
-fn gradients_of_means_are_those_of_autograd() {
+fn gradients_of_means_match_autograd() {
     for case in cases() {
         assert_rows_close(&case.what("means"), &case.v_model.means, &case.theirs.v_model.means);
     }
 }
 
 #[test]
-fn gradients_of_quaternions_are_those_of_autograd() {
+fn gradients_of_quaternions_match_autograd() {
     for case in cases() {
         assert_rows_close(&case.what("quaternions"), &case.v_model.quats, &case.theirs.v_model.quats);
     }
 }
 
 #[test]
-fn gradients_of_log_scales_are_those_of_autograd() {
+fn gradients_of_log_scales_match_autograd() {
     for case in cases() {
         assert_rows_close(
             &case.what("log scales"),
@@ -279,7 +279,7 @@ fn gradients_of_log_scales_are_those_of_autograd() {
 }
 
 #[test]
-fn gradients_of_opacity_logits_are_those_of_autograd() {
+fn gradients_of_opacity_logits_match_autograd() {
     for case in cases() {
         let theirs = &case.theirs.v_model.opacity_logits;
         assert_close(&case.what("opacity logits"), &case.v_model.opacity_logits, theirs);
@@ -287,7 +287,7 @@ fn gradients_of_opacity_logits_are_those_of_autograd() {
 }
 
 #[test]
-fn gradients_of_sh_coefficients_are_those_of_autograd() {
+fn gradients_of_sh_coefficients_match_autograd() {
     for case in cases() {
         let theirs = &case.theirs.v_model.sh_coeffs;
         assert_rows_close(&case.what("SH coefficients"), &case.v_model.sh_coeffs, theirs);

@@ -183,7 +183,7 @@ mod tests {
     };
 
     #[test]
-    fn three_updates_are_those_worked_out_by_hand() {
+    fn three_updates_match_those_worked_out_by_hand() {
         // Gradients 1, -2, 0.5 at rate 0.1:
         //   m  0.2      -0.24         -0.092
         //   v  0.01      0.0499        0.051901
@@ -205,7 +205,7 @@ mod tests {
     }
 
     #[test]
-    fn coefficients_share_the_second_moment_of_their_channel_and_the_rest_is_adam() {
+    fn compact_adam_shares_one_second_moment_per_colour_channel() {
         let (mut own, mut shared) = (Gaussians64::zeros(1, 1), Gaussians64::zeros(1, 1));
         let (mut own_state, mut state) = (AdamState::new(1, 1), AdamState::new(1, 1));
         for step in 1..=4 {
@@ -236,7 +236,7 @@ mod tests {
     }
 
     #[test]
-    fn each_parameter_moves_by_its_own_rate_and_only_where_the_view_sees_it() {
+    fn each_parameter_moves_by_its_rate_where_the_view_sees_it() {
         let mut model = Gaussians64::zeros(3, 1);
         let mut v_model = Gaussians64::zeros(3, 1);
         for index in 0..3 {

@@ -121,7 +121,7 @@ mod tests {
     }
 
     #[test]
-    fn the_gradient_of_the_loss_is_its_central_difference_for_every_parameter() {
+    fn every_gradient_of_the_loss_is_its_central_difference() {
         let (width, height) = (21, 18);
         let (camera, pose) = off_centre_view(width, height, 3.0);
         let (truth, mask) = photograph(width * height);

@@ -96,7 +96,7 @@ mod tests {
     }
 
     #[test]
-    fn gradients_through_a_water_that_follows_from_range_are_central_differences() {
+    fn gradients_through_dbdr_are_central_differences() {
         for i in 0..30 {
             let blend = [Blend::Srgb, Blend::Linear, Blend::OverBlack][(i % 3) as usize];
             let four = std::array::from_fn(|k| 2.0 * number(i, 20 + k as u32) - 1.0);
@@ -155,7 +155,7 @@ mod tests {
     }
 
     #[test]
-    fn the_identity_forms_what_the_nine_numbers_form_and_open_water_stays() {
+    fn the_identity_equals_constant_water_and_keeps_open_water() {
         let identity = RangeModulation::identity(2.0, 3.2);
         let pixel = Blended { rgb: [0.3, 0.2, 0.1], alpha: 0.7, range: 4.0 };
         let plain = form(&WATER, Medium::PerPixel, Blend::Linear, &pixel);

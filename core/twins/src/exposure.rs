@@ -94,7 +94,7 @@ mod tests {
     }
 
     #[test]
-    fn gradients_by_colours_and_exposure_are_the_central_differences_of_the_loss() {
+    fn gradients_by_colours_and_exposure_are_central_differences() {
         let (rgb, truth, exposure) = (picture(61), picture(62), some_exposure(63));
         let mask: Vec<bool> = (0..rgb.len()).map(|i| i % 5 != 0).collect();
         let of = |rgb: &[[f64; 3]], exposure: &Exposure| {

@@ -256,7 +256,7 @@ mod tests {
     }
 
     #[test]
-    fn parts_cover_a_side_evenly_and_shares_of_a_pixel_add_up_to_one() {
+    fn parts_cover_a_side_evenly_and_pixel_shares_sum_to_one() {
         for (count, side) in [(1, 1), (1, 50), (3, 100), (4, 7), (7, 7), (50, 1607)] {
             let parts: Vec<u32> = (0..side).map(|x| part_of(x, count, side)).collect();
             assert!(parts.is_sorted() && parts[0] == 0 && parts[side as usize - 1] == count - 1);
@@ -273,7 +273,7 @@ mod tests {
     }
 
     #[test]
-    fn gradients_by_picture_weights_and_embedding_are_central_differences() {
+    fn all_gradients_of_film_are_central_differences() {
         for (seed, size, cells) in [(501, [13, 7], [3, 2]), (502, [5, 4], [1, 1]), (503, [6, 9], [1, 4])] {
             let (rgb, weights, embedding) = (colours(seed, size), some_weights(seed), some_embedding(seed));
             let v: Vec<[f64; 3]> = colours(seed + 50, size).iter().map(|v| v.map(|v| v - 0.4)).collect();
@@ -323,7 +323,7 @@ mod tests {
     }
 
     #[test]
-    fn no_embedding_is_the_identity_whatever_the_weights_and_factors_are_bounded() {
+    fn a_zero_embedding_is_the_identity_and_factors_are_bounded() {
         let (rgb, size) = (colours(511, [9, 8]), [9, 8]);
         let picture = FilmPicture { rgb: &rgb, size, cells: [3, 2] };
         for (a, b) in
@@ -338,7 +338,7 @@ mod tests {
     }
 
     #[test]
-    fn embeddings_take_up_the_brightness_of_views_and_their_mean_stays_zero() {
+    fn embeddings_learn_brightness_and_their_mean_stays_zero() {
         let size = [24, 20];
         let rgb = colours(521, size);
         let picture = FilmPicture { rgb: &rgb, size, cells: [2, 2] };

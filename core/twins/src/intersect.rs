@@ -120,7 +120,7 @@ mod tests {
     use crate::{Gaussians64, RasterRules, project_forward};
 
     #[test]
-    fn the_least_sigma_of_a_tile_is_that_of_dense_sampling() {
+    fn the_least_sigma_of_a_tile_matches_dense_sampling() {
         const SAMPLES: u32 = 300;
         let (camera, pose) = off_centre_view(75, 53, 3.0);
         for (name, model) in all(11, 12, 0) {

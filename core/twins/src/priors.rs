@@ -258,7 +258,7 @@ mod tests {
     const CONFIG: DarkChannel = DarkChannel { weight: 0.7, negative: 30.0, radius: 2 };
 
     #[test]
-    fn gradients_of_the_dark_channel_are_central_differences_and_its_weights_are_constants() {
+    fn dark_channel_gradients_hold_its_weights_constant() {
         for masked in [0.0, 0.3] {
             for radius in [0, 1, 2, 20] {
                 let config = DarkChannel { radius, ..CONFIG };
@@ -304,7 +304,7 @@ mod tests {
     }
 
     #[test]
-    fn gradients_of_the_dark_channel_of_a_water_that_follows_from_range_are_central_differences() {
+    fn dark_channel_gradients_with_dbdr_are_central_differences() {
         let refinement = RangeModulation::identity(2.0, UNIT).with_array([0.3, -0.2, -0.7, 0.4]);
         let maps = Maps::new(0.1);
         let of = |maps: &Maps, refinement: &RangeModulation, water: &Water| {
@@ -368,7 +368,7 @@ mod tests {
     }
 
     #[test]
-    fn an_edge_of_either_sign_smooths_less_and_none_more_than_a_flat_photograph() {
+    fn an_edge_of_either_sign_smooths_less_than_a_flat_photograph() {
         let view = |photograph: [[f64; 3]; 2]| {
             let blended = [1.0, 2.0].map(|range| Blended { rgb: [0.0; 3], alpha: 1.0, range });
             let view =
@@ -382,7 +382,7 @@ mod tests {
     }
 
     #[test]
-    fn channels_that_the_water_takes_most_of_weigh_least_and_clear_water_weighs_all_alike() {
+    fn the_most_attenuated_channels_weigh_least() {
         let weights = channel_weights(&WATER, UNIT);
         assert!(weights[0] < weights[1] && weights[1] < weights[2]);
         assert_eq!(weights[2], 1.0);
@@ -407,7 +407,7 @@ mod tests {
     }
 
     #[test]
-    fn open_water_and_masked_pictures_have_no_dark_channel_and_no_gradient() {
+    fn open_water_and_masked_pictures_have_no_dark_channel() {
         let maps = Maps::new(0.0);
         let nothing = vec![Blended { rgb: [0.0; 3], alpha: 0.0, range: 0.0 }; maps.light.len()];
         let open = PriorView { blended: &nothing, ..maps.view() };

@@ -187,7 +187,7 @@ mod tests {
     }
 
     #[test]
-    fn the_gradient_is_the_central_difference_at_every_degree_and_shape() {
+    fn gradients_are_central_differences_at_every_degree_and_shape() {
         let (camera, pose) = off_centre_view(75, 53, 3.0);
         for (sh_degree, mip_filter) in [(0, false), (1, false), (2, false), (3, false), (1, true), (3, true)]
         {

@@ -198,7 +198,7 @@ mod tests {
     use crate::samples::off_centre_view;
 
     #[test]
-    fn with_the_filter_the_low_pass_spreads_a_splat_and_adds_nothing_to_it() {
+    fn under_the_mip_filter_the_low_pass_keeps_a_splats_integral() {
         let (camera, pose) = off_centre_view(75, 53, 3.0);
         let mut model = Gaussians64::zeros(1, 0);
         model.quats[0] = [0.9, 0.1, -0.3, 0.2];

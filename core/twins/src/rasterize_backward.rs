@@ -198,7 +198,7 @@ mod tests {
     }
 
     #[test]
-    fn the_gradient_is_the_central_difference_where_blending_has_no_edges() {
+    fn without_edges_the_gradient_is_the_central_difference() {
         check(&RasterRules::SMOOTH, 32, 1.0);
     }
 
@@ -229,14 +229,14 @@ mod tests {
     }
 
     #[test]
-    fn with_all_edges_the_gradient_is_the_central_difference_between_them() {
+    fn between_edges_the_gradient_is_the_central_difference() {
         // Where alpha crosses min_alpha within a step the image jumps, and the difference is of the order of
         // 1/255 / H. So the step is a hundredth, and these seeds have no crossing in it.
         check(&RasterRules::HARD, 33, 1e-2);
     }
 
     #[test]
-    fn contribution_is_the_share_of_the_image_and_abs_bounds_the_gradient() {
+    fn contribution_sums_to_alpha_and_abs_bounds_the_gradient() {
         let (camera, pose) = off_centre_view(WIDTH, HEIGHT, 3.0);
         let v = weights();
         for rules in [RasterRules::HARD, RasterRules::SMOOTH] {

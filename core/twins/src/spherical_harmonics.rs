@@ -109,7 +109,7 @@ mod tests {
     }
 
     #[test]
-    fn the_basis_is_the_real_spherical_harmonics_with_the_condon_shortley_phase() {
+    fn the_basis_is_real_harmonics_with_the_condon_shortley_phase() {
         for i in 0..50 {
             let d = direction(i);
             let (basis, phi) = (sh_basis(d), d.y.atan2(d.x));
@@ -134,7 +134,7 @@ mod tests {
     }
 
     #[test]
-    fn the_mean_square_over_a_band_is_the_same_in_every_band_and_direction() {
+    fn the_mean_square_of_a_band_is_the_same_in_all_directions() {
         for i in 0..50 {
             let basis = sh_basis(direction(i));
             for l in 0..=3_usize {

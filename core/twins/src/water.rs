@@ -252,7 +252,7 @@ mod tests {
     }
 
     #[test]
-    fn the_curve_and_its_slope_are_those_of_srgb() {
+    fn the_curve_and_its_slope_match_srgb() {
         for i in 1..200 {
             let x = f64::from(i) / 100.0;
             assert!((decode(x).0 - srgb_to_linear(x)).abs() < 1e-15);
@@ -266,7 +266,7 @@ mod tests {
     }
 
     #[test]
-    fn gradients_through_the_water_of_a_gaussian_are_central_differences() {
+    fn gradients_through_water_on_gaussians_are_central_differences() {
         for i in 0..20 {
             let blend = [Blend::Srgb, Blend::Linear][(i % 2) as usize];
             let rgb = [number(i, 0), number(i, 1), 1.3 * number(i, 2)];
@@ -298,7 +298,7 @@ mod tests {
     }
 
     #[test]
-    fn gradients_through_the_water_of_a_pixel_are_central_differences() {
+    fn gradients_through_water_on_pixels_are_central_differences() {
         for (medium, blend) in WAYS {
             for i in 0..20 {
                 let alpha = 0.05 + 0.95 * number(i, 3);
@@ -331,7 +331,7 @@ mod tests {
     }
 
     #[test]
-    fn one_opaque_layer_is_the_same_either_way_and_nothing_is_open_water_or_black() {
+    fn an_opaque_layer_looks_the_same_under_every_composition() {
         let (rgb, range) = ([0.6, 0.4, 0.3], 5.0);
         let layer = |colour| Blended { rgb: colour, alpha: 1.0, range };
         let light = in_water(&WATER, rgb, range);
@@ -356,7 +356,7 @@ mod tests {
     }
 
     #[test]
-    fn adam_finds_a_water_from_the_gradients_of_a_sum_of_squares_whatever_the_unit() {
+    fn adam_finds_the_water_at_any_scene_scale() {
         for unit in [0.01, 1.0, 300.0] {
             let scaled = |water: &Water| {
                 let [d, b] = [water.beta_d, water.beta_b].map(|beta| beta.map(|value| value * 7.0 / unit));
@@ -379,7 +379,7 @@ mod tests {
     }
 
     #[test]
-    fn the_weight_on_the_squares_makes_the_nine_smaller() {
+    fn the_l2_weight_shrinks_the_water_parameters() {
         let mut state = WaterState::new(&WATER, 7.0);
         (0..50).for_each(|_| state.step(&[0.0; 9], 7.0, 0.01, 1e-4));
         let pairs = state.water(7.0).to_array().into_iter().zip(WATER.to_array());
