@@ -1,4 +1,4 @@
-//! Metrics on held-out views while a run goes on.
+//! Metrics on held-out views during a run.
 
 use std::sync::Arc;
 
@@ -30,9 +30,9 @@ fn measuring_reports_the_current_model_and_changes_no_byte() {
         history[3].psnr_db > history[0].psnr_db + 1.0 && history[3].ssim > history[0].ssim,
         "{history:?}"
     );
-    assert_eq!(measured.measure(&held_out, || false).unwrap(), None, "told to stop");
+    assert_eq!(measured.measure(&held_out, || false).unwrap(), None, "a cancelled measurement must return nothing");
     let (plain, measured) = (plain.gaussians().unwrap(), measured.gaussians().unwrap());
-    assert_same_model("with measurements on the way", &plain, &measured);
+    assert_same_model("with measurements during the run", &plain, &measured);
 }
 
 #[test]
