@@ -7,21 +7,21 @@ use serde::Deserialize;
 
 use crate::expectations::{assert_close, assert_rows_close, read};
 
-/// What `make_metric_expectations.py` recorded.
+/// The record of `make_metric_expectations.py`.
 #[derive(Deserialize)]
 struct File {
     pictures: Vec<Pictures>,
     losses: Vec<LossRecord>,
 }
 
-/// Two pictures of 8 bits and what the peers say of them.
+/// Two 8-bit pictures and the results of the peers.
 #[derive(Deserialize)]
 struct Pictures {
     name: String,
-    /// Rows of RGB in hexadecimal digits.
+    /// Rows of RGB as hexadecimal digits.
     render: Vec<String>,
     truth: Vec<String>,
-    /// Rows of 1 (counts) and 0.
+    /// Rows of 1 (counts) and 0 (masked).
     mask: Vec<String>,
     psnr_db: f64,
     ssim: f64,
@@ -45,7 +45,7 @@ struct LossRecord {
 }
 
 impl Pictures {
-    /// Render, in which all pixels count, and truth with the mask.
+    /// The render without a mask, and the true picture with the mask.
     fn packed(&self) -> (PackedImage, PackedImage) {
         let mut truth = packed(&self.truth);
         for (pixel, counts) in truth.pixels.iter_mut().zip(self.mask.concat().bytes()) {

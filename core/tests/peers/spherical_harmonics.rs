@@ -11,7 +11,7 @@ struct File {
     cases: Vec<Case>,
 }
 
-/// One Gaussian seen along `direction`, which is not of length 1; (degree + 1)^2 coefficients.
+/// One Gaussian seen along `direction`, which is not normalised; (degree + 1)^2 coefficients.
 #[derive(Deserialize)]
 struct Case {
     direction: [f64; 3],
@@ -35,7 +35,7 @@ fn by_degree() -> Vec<(usize, Vec<Case>)> {
         let degree = case.coeffs.len().isqrt() - 1;
         degrees[degree].1.push(case);
     }
-    assert!(degrees.iter().all(|(_, cases)| cases.len() >= 10), "directions at every degree");
+    assert!(degrees.iter().all(|(_, cases)| cases.len() >= 10), "every degree needs at least 10 directions");
     degrees
 }
 
@@ -45,7 +45,7 @@ fn colours_by_direction_match_gsplat_at_every_degree() {
         let ours: Vec<_> = cases.iter().map(|case| sh_colour(case.unit(), &case.coeffs)).collect();
         let theirs: Vec<_> = cases.iter().map(|case| case.rgb).collect();
         assert_rows_close(&format!("colour at degree {degree}"), &ours, &theirs);
-        assert!(theirs.iter().flatten().any(|&v| v == 0.0), "degree {degree}: a channel that is clamped");
+        assert!(theirs.iter().flatten().any(|&v| v == 0.0), "degree {degree}: no channel is clamped");
     }
 }
 
@@ -76,7 +76,7 @@ fn gradients_of_viewing_direction_match_gsplat_at_every_degree() {
         let ours: Vec<_> = cases.iter().map(v_direction).collect();
         let theirs: Vec<_> = cases.iter().map(|case| case.v_direction).collect();
         if degree == 0 {
-            assert_eq!(ours, theirs, "the constant harmonic does not depend on the direction");
+            assert_eq!(ours, theirs, "the constant harmonic must not depend on the direction");
         } else {
             assert_rows_close(&format!("gradient of direction at degree {degree}"), &ours, &theirs);
         }

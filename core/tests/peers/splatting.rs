@@ -9,7 +9,7 @@ use serde::Deserialize;
 
 use crate::expectations::{assert_close, assert_rows_close, read};
 
-/// What `make_expectations.py` recorded of one scene.
+/// The record of one scene by `make_expectations.py`.
 #[derive(Deserialize)]
 struct Scene {
     camera: PinholeCamera,
@@ -32,7 +32,7 @@ struct PoseRecord {
     translation: [f64; 3],
 }
 
-/// A model, or the gradient of one; rows as in [`Gaussians64`].
+/// A model or its gradient; rows as in [`Gaussians64`].
 #[derive(Deserialize)]
 struct ModelRecord {
     means: Vec<[f64; 3]>,
@@ -42,7 +42,7 @@ struct ModelRecord {
     sh_coeffs: Vec<[f64; 3]>,
 }
 
-/// Splats, or the gradients of them, by Gaussian; `None` where a Gaussian is behind the camera or too near.
+/// Splats or their gradients, by Gaussian; `None` where a Gaussian is behind the camera or too near.
 #[derive(Deserialize)]
 struct SplatRecord {
     mean2d: Vec<Option<[f64; 2]>>,
@@ -50,7 +50,7 @@ struct SplatRecord {
     rgb: Vec<Option<[f64; 3]>>,
     opacity: Vec<Option<f64>>,
     range: Vec<Option<f64>>,
-    /// Not in gradients: depth only orders.
+    /// Missing in gradients, because depth only decides the order.
     #[serde(default)]
     depth: Vec<Option<f64>>,
 }
@@ -62,7 +62,7 @@ struct RasterRecord {
     range: Vec<f64>,
 }
 
-/// What happened in a scene, as the script counted it.
+/// How often each edge case occurred in a scene, as counted by the script.
 #[derive(Deserialize)]
 struct Counts {
     capped_pairs: u32,
@@ -73,7 +73,7 @@ struct Counts {
     black_channels: u32,
 }
 
-/// A recorded scene and what the twins make of it.
+/// A recorded scene and the results of the twins.
 struct Case {
     name: &'static str,
     theirs: Scene,
@@ -105,7 +105,8 @@ impl Case {
         Self { name, theirs, splats, raster, v_splats, v_model }
     }
 
-    /// Compares one number (or array) of the splats, by those Gaussians that both draw.
+    /// Compares one number (or array) of the splats for all Gaussians that we draw; gsplat must draw them
+    /// too.
     fn assert_splats<const N: usize>(
         &self,
         what: &str,
@@ -116,7 +117,7 @@ impl Case {
         for (i, splat) in self.splats.iter().enumerate() {
             if let Some(splat) = splat {
                 a.push(ours(splat, &self.v_splats[i]));
-                b.push(theirs[i].unwrap_or_else(|| panic!("{}: only we draw Gaussian {i}", self.name)));
+                b.push(theirs[i].unwrap_or_else(|| panic!("{}: gsplat does not draw Gaussian {i}, but we do", self.name)));
             }
         }
         assert_rows_close(&format!("{}, {what}", self.name), &a, &b);
@@ -173,7 +174,7 @@ fn scenes_show_every_edge_and_one_has_gsplats_cap_of_alpha() {
         ("ratios that are clamped in the Jacobian", |c| c.clamped_ratios),
         ("Gaussians behind the camera or too near", |c| c.behind_or_near),
         ("Gaussians under 1/255", |c| c.transparent),
-        ("channels that are clamped at black", |c| c.black_channels),
+        ("channels that are clamped at 0", |c| c.black_channels),
     ];
     for (what, count) in counts {
         assert!(shows.iter().map(count).sum::<u32>() > 0, "{what}");
