@@ -69,8 +69,15 @@ fn memory_is_counted_until_the_last_clone_is_dropped() {
     let read: Vec<u32> = gpu.read(&buffer, 0, 2 * MIB as usize).unwrap();
     assert!(read.iter().all(|&word| word == 0));
     let memory = gpu.memory().unwrap();
-    assert_eq!(memory.allocated_bytes, before.allocated_bytes + with_both, "a read did not release its memory");
-    assert!(memory.peak_bytes >= memory.allocated_bytes + 8 * MIB, "the peak does not include the read-back buffer");
+    assert_eq!(
+        memory.allocated_bytes,
+        before.allocated_bytes + with_both,
+        "a read did not release its memory"
+    );
+    assert!(
+        memory.peak_bytes >= memory.allocated_bytes + 8 * MIB,
+        "the peak does not include the read-back buffer"
+    );
 
     let clone = buffer.clone();
     drop((buffer, uniform));

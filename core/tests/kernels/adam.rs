@@ -142,7 +142,11 @@ fn compare_kind(
         );
         let k = after.coeffs();
         let coefficients = |m: &Gaussians| m.sh_coeffs[index * k..(index + 1) * k].to_vec();
-        assert_same_bits("coefficients of the same Gaussian", &coefficients(&scene.model), &coefficients(&after));
+        assert_same_bits(
+            "coefficients of the same Gaussian",
+            &coefficients(&scene.model),
+            &coefficients(&after),
+        );
     }
 }
 

@@ -72,7 +72,10 @@ fn black_walls_become_opaque_only_over_random_backgrounds() {
     };
     let (on, off) = (trained(random(240)), trained(config(240)));
     // Measured: 0.91 and 0.02.
-    assert!(on > 0.85 && off < 0.2, "mean alpha where photographs are black: {on} over random colours, {off} over black");
+    assert!(
+        on > 0.85 && off < 0.2,
+        "mean alpha where photographs are black: {on} over random colours, {off} over black"
+    );
 }
 
 #[test]

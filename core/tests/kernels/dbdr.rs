@@ -51,7 +51,13 @@ struct Outputs {
     left_out: u32,
 }
 
-fn iteration(gpu: &Arc<Gpu>, start: MediumRun, [width, height]: [u32; 2], v: &[[f32; 4]], seed: u32) -> Outputs {
+fn iteration(
+    gpu: &Arc<Gpu>,
+    start: MediumRun,
+    [width, height]: [u32; 2],
+    v: &[[f32; 4]],
+    seed: u32,
+) -> Outputs {
     let (image, range) = picture(width * height, seed);
     let mut water = DeviceMedium::new(gpu, start).unwrap();
     let mut frame = Frame::new(gpu, 1, 1, 1).unwrap();
@@ -191,9 +197,16 @@ fn the_identity_is_the_water_without_a_refinement_to_the_bit() {
         assert_same_bits("gradients by colour and alpha", &plain.v_image, &refined.v_image);
         assert_same_bits("gradients by range", &plain.v_range, &refined.v_range);
         assert_same_bits("gradients by the water parameters", &plain.v_water, &refined.v_water);
-        assert_same_bits("the water parameters after a step", &plain.water.to_array(), &refined.water.to_array());
+        assert_same_bits(
+            "the water parameters after a step",
+            &plain.water.to_array(),
+            &refined.water.to_array(),
+        );
         assert_eq!(plain.refinement, None);
-        assert!(refined.refinement.unwrap().to_array().iter().all(|value| *value != 0.0), "the refinement must move");
+        assert!(
+            refined.refinement.unwrap().to_array().iter().all(|value| *value != 0.0),
+            "the refinement must move"
+        );
     }
 }
 

@@ -75,7 +75,10 @@ fn colours_gradients_and_steps_of_any_size_match_the_twin() {
                 fathom_twins::expose_backward(&wide(&render), &wide(&v_exposed), &exposure);
             assert_near(&format!("{what}, gradient"), &v_rendered, &v_rgb, 1e-5);
             assert!(exposed.iter().zip(&render).all(|(a, b)| a[3] == b[3]), "{what}: alpha must not change");
-            assert!(v_rendered.iter().zip(&v_exposed).all(|(a, b)| a[3] == b[3]), "{what}: the gradient of alpha must not change");
+            assert!(
+                v_rendered.iter().zip(&v_exposed).all(|(a, b)| a[3] == b[3]),
+                "{what}: the gradient of alpha must not change"
+            );
 
             twin.step(view as usize, &v_exposure, 0.05);
             let after = exposures.download(&gpu).unwrap();
@@ -178,7 +181,11 @@ fn exposures_that_do_not_learn_change_no_byte() {
     };
     let still = TrainConfig { exposure_lr: 0.0, exposure_lr_end: 0.0, ..exposed(24) };
     assert_same_model("a rate of 0", &trained(config(24)), &trained(still));
-    assert_ne!(trained(config(24)).means, trained(exposed(24)).means, "exposures that learn must change the model");
+    assert_ne!(
+        trained(config(24)).means,
+        trained(exposed(24)).means,
+        "exposures that learn must change the model"
+    );
 }
 
 #[test]

@@ -101,7 +101,10 @@ fn colours_gradients_and_steps_of_any_size_match_the_twin() {
             let gradients = flat(&v_rendered).into_iter();
             assert_near(&format!("{what}, gradient"), gradients, by.rgb.iter().copied().flatten(), 2e-5);
             assert!(filmed.iter().zip(&render).all(|(a, b)| a[3] == b[3]), "{what}: alpha must not change");
-            assert!(v_rendered.iter().zip(&v_filmed).all(|(a, b)| a[3] == b[3]), "{what}: the gradient of alpha must not change");
+            assert!(
+                v_rendered.iter().zip(&v_filmed).all(|(a, b)| a[3] == b[3]),
+                "{what}: the gradient of alpha must not change"
+            );
 
             twin.step(view as usize, &by, RATE.into(), f64::from(RATE) * f64::from(VIEWS).sqrt());
             let embeddings = film.embeddings(&gpu).unwrap();

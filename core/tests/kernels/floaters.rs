@@ -56,5 +56,8 @@ fn floaters_fade_where_the_view_is_known_to_be_clear() {
     assert_eq!(opacities(&gpu, &photographs, CLEAR, 0.0), (kept, scene));
     let (faded, with_it_gone) = opacities(&gpu, &photographs, CLEAR, 20.0);
     assert!(faded < 0.2 * BEGINS_AT && faded < 0.5 * kept, "{faded} of {kept}");
-    assert!((with_it_gone / scene - 1.0).abs() < 0.1, "the scene itself must stay: {with_it_gone} of {scene}");
+    assert!(
+        (with_it_gone / scene - 1.0).abs() < 0.1,
+        "the scene itself must stay: {with_it_gone} of {scene}"
+    );
 }

@@ -53,7 +53,11 @@ fn runs_under_extreme_waters_stay_finite() {
     let uneven = Water { beta_d: [1e-9, 1e-3, 30.0], beta_b: [30.0, 0.0, 1e-9], b_inf: [0.0, 1.0, 0.5] };
     for composed in COMPOSITIONS {
         for (name, water) in [("air", air), ("mud", mud), ("uneven channels", uneven)] {
-            assert_sound(&format!("{name}, {composed:?}"), &gpu, under(&photographs, with(composed), water, 3.2));
+            assert_sound(
+                &format!("{name}, {composed:?}"),
+                &gpu,
+                under(&photographs, with(composed), water, 3.2),
+            );
         }
     }
 }
@@ -95,7 +99,8 @@ fn photographs_of_open_water_alone_set_its_colour() {
     for composed in COMPOSITIONS {
         let config_of_water =
             WaterConfig { lr: 0.1, lr_end: 0.02, start_at: 0.0, freeze_at: 1.0, ..with(composed) };
-        let (_, water) = assert_sound(&format!("{composed:?}"), &gpu, under(&blue, config_of_water, start, 3.2));
+        let (_, water) =
+            assert_sound(&format!("{composed:?}"), &gpu, under(&blue, config_of_water, start, 3.2));
         let [red, green, blue] = water.b_inf;
         assert!(red < green && green < blue, "{composed:?}: {water:?}");
         assert!(red < 0.05 && blue > 0.15, "{composed:?}: {water:?}");
@@ -111,6 +116,10 @@ fn runs_stay_finite_at_huge_and_tiny_scene_scales() {
     let water = Water { beta_d: [1e-5; 3], beta_b: [1e-5; 3], b_inf: [0.1, 0.2, 0.3] };
     for composed in COMPOSITIONS {
         assert_sound(&format!("{composed:?}"), &gpu, under(&photographs, with(composed), water, 3e4));
-        assert_sound(&format!("{composed:?}, tiny scale"), &gpu, under(&photographs, with(composed), water, 1e-4));
+        assert_sound(
+            &format!("{composed:?}, tiny scale"),
+            &gpu,
+            under(&photographs, with(composed), water, 1e-4),
+        );
     }
 }

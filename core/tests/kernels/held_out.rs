@@ -30,7 +30,11 @@ fn measuring_reports_the_current_model_and_changes_no_byte() {
         history[3].psnr_db > history[0].psnr_db + 1.0 && history[3].ssim > history[0].ssim,
         "{history:?}"
     );
-    assert_eq!(measured.measure(&held_out, || false).unwrap(), None, "a cancelled measurement must return nothing");
+    assert_eq!(
+        measured.measure(&held_out, || false).unwrap(),
+        None,
+        "a cancelled measurement must return nothing"
+    );
     let (plain, measured) = (plain.gaussians().unwrap(), measured.gaussians().unwrap());
     assert_same_model("with measurements during the run", &plain, &measured);
 }

@@ -533,7 +533,11 @@ fn context_is_seen_but_never_changes() {
     assert_eq!(trainer.gaussians().unwrap().len(), 100);
     let mut alone = Trainer::new(Arc::clone(&gpu), without).unwrap();
     alone.advance(30).unwrap();
-    assert_ne!(alone.gaussians().unwrap().means, trainer.gaussians().unwrap().means, "the context must be visible");
+    assert_ne!(
+        alone.gaussians().unwrap().means,
+        trainer.gaussians().unwrap().means,
+        "the context must be visible"
+    );
 }
 
 #[test]

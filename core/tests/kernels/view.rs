@@ -154,7 +154,12 @@ impl View {
         let mut recorder = Recorder::new(&self.gpu);
         self.frame.record_forward(&self.gpu, &mut recorder, &self.blocks, &self.uniform).unwrap();
         recorder.submit();
-        assert_eq!(self.frame.overflow(&self.gpu).unwrap(), None, "{}: the lists must be large enough", self.scene.name);
+        assert_eq!(
+            self.frame.overflow(&self.gpu).unwrap(),
+            None,
+            "{}: the lists must be large enough",
+            self.scene.name
+        );
     }
 
     pub fn pixels(&self) -> usize {

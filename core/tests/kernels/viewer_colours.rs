@@ -46,7 +46,11 @@ fn new_colours_alone_show_a_linear_model_in_srgb_viewers() {
     };
     let (found, reported) = find(620);
     assert_eq!((reported.first(), reported.last()), (Some(&50), Some(&620)));
-    assert_eq!(Gaussians { sh_coeffs: model.sh_coeffs.clone(), ..found.clone() }, model, "only colours may change");
+    assert_eq!(
+        Gaussians { sh_coeffs: model.sh_coeffs.clone(), ..found.clone() },
+        model,
+        "only colours may change"
+    );
     let own = picture(&gpu, &model, Some(shown), &held_out);
     let [before, after] = [&model, &found].map(|model| psnr(&picture(&gpu, model, None, &held_out), &own));
     // The remaining difference is at the edges of Gaussians over black, which no colour can correct.

@@ -164,7 +164,8 @@ fn check_pictures(
     let mut v_water = [0.0; 9];
     // Over black, open water looks like the scene, so these terms are off.
     let is_separable = if composed.1 == Blend::OverBlack { 0.0 } else { 1.0 };
-    let [background, surface] = [0.3, 0.2].map(|weight: f32| is_separable * f64::from(weight / pixels as f32));
+    let [background, surface] =
+        [0.3, 0.2].map(|weight: f32| is_separable * f64::from(weight / pixels as f32));
     for i in 0..pixels as usize {
         let [r, g, b, alpha] = image[i].map(f64::from);
         let pixel = Blended { rgb: [r, g, b], alpha, range: f64::from(range[i]) };
@@ -314,7 +315,10 @@ fn gradients_of_gaussians_and_water_parameters_match_the_twin() {
                     }
                 }
                 let share = (difference / length).sqrt();
-                assert!(length > 0.0 && share < 2e-4, "{kind}: the gradients differ by {share:e} of their length");
+                assert!(
+                    length > 0.0 && share < 2e-4,
+                    "{kind}: the gradients differ by {share:e} of their length"
+                );
             }
 
             let config = with((Medium::PerGaussian, blend));
@@ -414,7 +418,10 @@ fn a_nan_gradient_moves_no_water_parameter_and_is_counted() {
         assert_eq!(left_out, 1);
         assert!(after.b_inf.iter().zip(before.b_inf).all(|(a, b)| *a < b), "open water must get darker");
         for (after, before) in after.beta_d.iter().zip(before.beta_d) {
-            assert!((after / before - 1.0).abs() < 1e-5, "nothing depends on range, so beta_d must stay: {after} and {before}");
+            assert!(
+                (after / before - 1.0).abs() < 1e-5,
+                "nothing depends on range, so beta_d must stay: {after} and {before}"
+            );
         }
     }
 }
@@ -461,10 +468,7 @@ fn frozen_water_stays_and_sh0_while_free_delays_harmonics() {
     assert_eq!(trainer.water().unwrap(), before);
     let view_dependence =
         |model: &Gaussians| model.sh_coeffs.iter().skip(1).step_by(4).flatten().any(|c| *c != 0.0);
-    assert!(
-        view_dependence(&trainer.gaussians().unwrap()),
-        "a frozen water must not delay the harmonics"
-    );
+    assert!(view_dependence(&trainer.gaussians().unwrap()), "a frozen water must not delay the harmonics");
 
     let moving = |sh0_while_free| {
         let water = WaterConfig { freeze_at: 0.5, sh0_while_free, ..with(COMPOSITIONS[0]) };
@@ -474,7 +478,10 @@ fn frozen_water_stays_and_sh0_while_free_delays_harmonics() {
     };
     assert!(view_dependence(&moving(false).gaussians().unwrap()), "harmonics must not wait for the water");
     let mut trainer = moving(true);
-    assert!(!view_dependence(&trainer.gaussians().unwrap()), "colours must not depend on direction while the water moves");
+    assert!(
+        !view_dependence(&trainer.gaussians().unwrap()),
+        "colours must not depend on direction while the water moves"
+    );
     let moved = trainer.water().unwrap();
     assert_ne!(moved, before);
     trainer.advance(30).unwrap();

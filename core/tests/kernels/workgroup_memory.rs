@@ -215,10 +215,7 @@ fn rubbish_in_workgroup_memory_changes_no_byte() {
         // The rubbish must survive for this test to prove anything. GPU drivers may clear it, so only CPU
         // adapters must keep it. Several tries, because a driver thread may run another test between two
         // kernels.
-        assert!(
-            (0..50).any(|_| rubbish.stays()) || !gpu.adapter().is_cpu,
-            "no kernel can read the rubbish"
-        );
+        assert!((0..50).any(|_| rubbish.stays()) || !gpu.adapter().is_cpu, "no kernel can read the rubbish");
         let plain = iteration(&gpu, |gpu| Recorder::new(gpu));
         *RUBBISH.lock().unwrap_or_else(PoisonError::into_inner) = Some(rubbish);
         let filled = iteration(&gpu, |gpu| Recorder::stepped(gpu, fill));

@@ -7,9 +7,9 @@
 `main.rs` compares the twins in `core/twins/src` with the files that this script writes to `expectations/`. README.md
 lists the conventions that differ.
 
-gsplat (`gsplat/cuda/_torch_impl.py`, called as in its `rendering.py`) computes: covariances from quaternions and scales,
-projection, spherical harmonics, tile lists, alpha, and blending, with nerfacc's products and sums along a ray. autograd
-computes every derivative. This script computes:
+gsplat (`gsplat/cuda/_torch_impl.py`, called as in its `rendering.py`) computes: covariances from quaternions and
+scales, projection, spherical harmonics, tile lists, alpha, and blending, with nerfacc's products and sums along a ray.
+autograd computes every derivative. This script computes:
 
 - The pairs of pixel and Gaussian that are blended. gsplat only has a CUDA kernel for this; `PairsToBlend` applies its
   rule to gsplat's own tile lists. A choice has no derivative, so no gradient comes from this script.
@@ -65,7 +65,8 @@ class PairsToBlend:
             for x in range(width):
                 alphas = alphas_at(x, y, means2d[0], conics[0], opacities[0])
                 listed = lists[y // tile_size * offsets.shape[-1] + x // tile_size]
-                # Neither gsplat's box of 3.33 sigma nor our ellipse may exclude a Gaussian above the least alpha.
+                # Neither gsplat's box of 3.33 sigma nor our ellipse may exclude a Gaussian above
+                # the least alpha.
                 assert set(numpy.flatnonzero((alphas >= MIN_ALPHA) & self.in_front)) <= set(listed)
                 blended = self.blended([int(gaussian) for gaussian in listed], alphas)
                 gaussians += blended
@@ -81,7 +82,7 @@ class PairsToBlend:
             if alpha < MIN_ALPHA:
                 continue
             after = left * (1.0 - min(alpha, self.cap))
-            # Two at our cap leave 1.0000000000000018e-4, so neither gsplat's T <= 1e-4 nor our T < 1e-4 stops.
+            # Two at our cap leave 1.0000000000000018e-4: neither gsplat's T <= 1e-4 nor our T < 1e-4 stops.
             assert clear(after, MIN_TRANSMITTANCE) or after == (1.0 - OUR_CAP) ** 2
             if after < MIN_TRANSMITTANCE:
                 self.stopped_pixels += 1

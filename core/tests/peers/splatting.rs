@@ -117,7 +117,9 @@ impl Case {
         for (i, splat) in self.splats.iter().enumerate() {
             if let Some(splat) = splat {
                 a.push(ours(splat, &self.v_splats[i]));
-                b.push(theirs[i].unwrap_or_else(|| panic!("{}: gsplat does not draw Gaussian {i}, but we do", self.name)));
+                b.push(theirs[i].unwrap_or_else(|| {
+                    panic!("{}: gsplat does not draw Gaussian {i}, but we do", self.name)
+                }));
             }
         }
         assert_rows_close(&format!("{}, {what}", self.name), &a, &b);
