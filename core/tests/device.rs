@@ -262,7 +262,7 @@ fn without_memory(gpu: &Arc<Gpu>) {
 }
 
 #[test]
-fn a_lost_device_is_a_typed_error_whatever_is_asked_of_it_first() {
+fn a_lost_device_is_a_typed_error_in_every_call() {
     type Case = (&'static str, fn(&Arc<Gpu>, &wgpu::Buffer, &mut Trainer) -> fathom_core::Result<()>);
     let cases: [Case; 10] = [
         ("buffer", |gpu, _, _| gpu.buffer("late", 64).map(drop).and(gpu.wait())),

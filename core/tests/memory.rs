@@ -20,7 +20,7 @@ fn resident_mib() -> f64 {
 /// `veiled` in shaders/shared/frame.wgsl). The copies are never released: at least 0.3 MiB per iteration, 60
 /// MiB over the 200 iterations measured here.
 #[test]
-fn a_run_does_not_grow_with_its_iterations() {
+fn memory_does_not_grow_with_the_iterations_of_a_run() {
     let Some(gpu) = device_for_test("the memory of a long run") else { return };
     let (camera, pose) = off_centre_view(64, 48, 3.0);
     let views = vec![TrainView { name: "grey".into(), camera, pose, clear_range: 0.0 }];

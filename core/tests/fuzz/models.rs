@@ -116,7 +116,7 @@ fn fuzzed_sparse_points_are_read_or_refused_and_have_one_form() {
 }
 
 #[test]
-fn a_fuzzed_state_of_a_network_is_taken_or_refused() {
+fn a_fuzzed_state_of_a_network_is_accepted_or_refused() {
     let network = || WaterParamNet::new(8, RELEASE_PRIOR.to_raw(1.0), 7).unwrap();
     let sound = network().to_bytes();
     // Corrects the digest at the end, as an attacker who changes the content can.

@@ -171,7 +171,7 @@ fn fuzzed_tiffs_are_decoded_or_refused() {
 }
 
 #[test]
-fn fuzzed_masks_are_laid_over_a_photograph_or_refused() {
+fn fuzzed_masks_are_applied_to_a_photograph_or_refused() {
     let photograph = png(ExtendedColorType::Rgb8);
     let camera = camera((WIDTH, HEIGHT));
     let read = |bytes: &[u8]| {

@@ -34,7 +34,7 @@ fn visible(gpu: &Gpu, view: &View) -> (Vec<usize>, u32) {
 }
 
 #[test]
-fn bounds_leave_out_much_and_nothing_that_is_visible() {
+fn bounds_skip_many_chunks_and_nothing_visible() {
     type Make = fn(u32, usize, u8) -> Gaussians;
     let models: [(&str, Make); 4] = [
         ("random", samples::random),

@@ -231,7 +231,7 @@ fn saturated_factors_stay_finite_and_nan_gradients_move_nothing() {
 }
 
 #[test]
-fn a_renderer_of_the_record_shows_what_the_trainer_compares() {
+fn a_renderer_from_the_record_matches_the_trainer() {
     let ways = [
         (medium::DECODED, Composition::PixelsLinear),
         (medium::AS_SHOWN, Composition::PixelsSrgb),

@@ -97,7 +97,7 @@ fn colours_gradients_and_steps_of_any_size_match_the_twin() {
 }
 
 #[test]
-fn nothing_is_stepped_while_a_list_is_too_short() {
+fn nothing_steps_while_a_list_is_too_short() {
     for gpu in layouts() {
         let mut exposures = Exposures::new(&gpu, 3).unwrap();
         exposures.prepare(&gpu, [20, 10]).unwrap();

@@ -150,7 +150,7 @@ fn every_degree_of_every_model_has_the_colours_of_the_twin() {
 }
 
 #[test]
-fn cameras_far_off_their_centre_see_what_the_twin_sees() {
+fn far_off_centre_cameras_see_the_same_as_the_twin() {
     let Some(gpu) = device() else { return };
     // Principal points outside the picture, long and short lenses, thin pictures.
     for (width, height, cx, cy, focal) in [

@@ -78,7 +78,7 @@ fn pictures_under_water_and_gradients_match_the_twin() {
     }
 }
 
-/// Changes by a factor of a few within the picture and reaches its limit in one corner.
+/// A water colour that changes by a factor of a few within the picture and reaches its limit in one corner.
 const BY_DIRECTION: ByDirection = ByDirection {
     middle: [0.0, 0.6, 0.8],
     slopes: [[0.3, -1.0, 0.0], [0.0, -2.0, 0.2], [1.5, -3.0, 0.0]],

@@ -1,4 +1,4 @@
-//! Spherical harmonics against gsplat's: values, and gradients by coefficients and direction.
+//! Spherical harmonics against gsplat: values, and gradients with respect to coefficients and direction.
 
 use fathom_twins::{sh_colour, sh_colour_backward};
 use glam::DVec3;
@@ -28,7 +28,7 @@ impl Case {
     }
 }
 
-/// All cases of one degree, for every degree.
+/// All cases, grouped by degree.
 fn by_degree() -> Vec<(usize, Vec<Case>)> {
     let mut degrees: Vec<(usize, Vec<Case>)> = (0..=3).map(|degree| (degree, Vec::new())).collect();
     for case in read::<File>("spherical_harmonics").cases {
@@ -69,7 +69,7 @@ fn gradients_of_viewing_direction_match_gsplat_at_every_degree() {
         let v_direction = |case: &Case| {
             let mut ignored = vec![[0.0; 3]; case.coeffs.len()];
             let free = sh_colour_backward(case.unit(), &case.coeffs, case.v_rgb, &mut ignored);
-            // Through direction / |direction|, as project_backward does.
+            // Through direction / |direction|, as in project_backward.
             let tangent = free - case.unit() * case.unit().dot(free);
             (tangent / DVec3::from(case.direction).length()).to_array()
         };

@@ -90,7 +90,7 @@ mod tests {
     }
 
     #[test]
-    fn the_tiled_renderer_gives_what_a_renderer_without_tiles_gives() {
+    fn the_tiled_renderer_matches_one_without_tiles() {
         for (width, height) in [(75, 53), (16, 16), (17, 1), (1, 33)] {
             let (camera, pose) = off_centre_view(width, height, 3.0);
             for rules in [RasterRules::HARD, RasterRules::SMOOTH] {

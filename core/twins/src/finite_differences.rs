@@ -4,7 +4,7 @@
 //! f^(5) + eps |f| / H. With H = 1e-4 and |f| near 1, the second term is 1e-12. The first term is larger for
 //! sharp functions, such as needles that fall off within a pixel.
 
-/// Step.
+/// The wider of the two steps.
 pub const H: f64 = 1e-4;
 /// Allowed relative error. Over all test scenes, the worst measured error is 1e-7 at this step, without
 /// gradients that are small against the largest of their kind. A wrong term causes 1e-2 or more.

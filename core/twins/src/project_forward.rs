@@ -118,7 +118,7 @@ pub(super) struct Geometry {
 }
 
 impl Geometry {
-    /// At Gaussian `index`, whose centre in the camera's frame is `m`.
+    /// The geometry at Gaussian `index`, whose centre in the camera's frame is `m`.
     pub fn new(model: &Gaussians64, index: usize, camera: &PinholeCamera, pose: &Pose, m: DVec3) -> Self {
         let world_to_camera = DMat3::from_quat(pose.rotation);
         let rotation = rotation_matrix(model.quats[index]);

@@ -10,8 +10,8 @@ use fathom_core::rng::{Stream, uniform_at};
 use fathom_core::scene::{PinholeCamera, Pose};
 use fathom_core::views::{InMemory, TrainView};
 
-/// A view whose size is no multiple of a tile, whose principal point is off the centre and whose
-/// pixels are not square. It looks along z from about `eye_distance` in front of the origin, a little turned.
+/// A view with an off-centre principal point and pixels that are not square. It looks along z from about
+/// `eye_distance` in front of the origin, slightly turned.
 pub fn off_centre_view(width: u32, height: u32, eye_distance: f64) -> (PinholeCamera, Pose) {
     let (w, h) = (f64::from(width), f64::from(height));
     let camera = PinholeCamera { width, height, fx: 0.9 * w, fy: 1.05 * w, cx: 0.41 * w, cy: 0.57 * h };

@@ -1,9 +1,9 @@
 //! Water between Gaussians and camera (SMP-UWGS eq. 7), its backward pass, and Adam on the water parameters
 //! (eq. 8).
 //!
-//! Colours of Gaussians are J in sRGB. Where the water acts on Gaussians, they are decoded, attenuated at
-//! their own range, and blended in linear light or, encoded again, in sRGB. Otherwise the water acts on the
-//! blended pixels. The sRGB curve continues above 1, and as a straight line below 0.
+//! Colours of Gaussians are J in sRGB. They are blended in sRGB or, decoded, in linear light. Water on
+//! Gaussians acts on the decoded colour at the Gaussian's own range, before blending. Water on pixels acts
+//! after blending. The sRGB curve continues above 1, and as a straight line below 0.
 
 use super::{SplatGradient, adam_update_with};
 use fathom_core::config::{Blend, Medium};
@@ -41,9 +41,9 @@ pub fn in_water(water: &Water, rgb: [f64; 3], range: f64) -> [f64; 3] {
     })
 }
 
-/// Factors on the learning rates of the constant colour under water, per channel. Each is 1 over the slope of
-/// the seen sRGB value with respect to the colour, between 1 and [`MAX_COLOUR_LR_SCALE`]. Higher bands keep
-/// their rate (bench/history.jsonl).
+/// Factors on the learning rates of the constant colour under water, per channel. Each is the inverse slope
+/// of the visible sRGB value with respect to the colour, between 1 and [`MAX_COLOUR_LR_SCALE`]. Higher bands
+/// keep their rate (bench/history.jsonl).
 pub fn lr_scale_under_water(water: &Water, rgb: [f64; 3], range: f64) -> [f64; 3] {
     let seen = in_water(water, rgb, range);
     std::array::from_fn(|c| {
@@ -53,8 +53,8 @@ pub fn lr_scale_under_water(water: &Water, rgb: [f64; 3], range: f64) -> [f64; 3
 }
 
 /// Backward pass of [`in_water`]. Replaces the gradient with respect to the blended light by that with
-/// respect to the colour. Adds to the gradient of the splat's range, and to `v_water`, the gradient of the
-/// water parameters.
+/// respect to the colour. Adds to the gradient of the splat's range, and adds the gradient of the water
+/// parameters to `v_water`.
 pub fn in_water_backward(
     water: &Water,
     blend: Blend,
@@ -260,7 +260,7 @@ mod tests {
             let x = f64::from(i) / 100.0;
             assert!((decode(x).0 - srgb_to_linear(x)).abs() < 1e-15);
             assert!((encode(x).0 - linear_to_srgb(x)).abs() < 1e-15);
-            // Both curves have a bend; 0.03 and 0.04 on either side of one.
+            // Both curves have a bend; 0.03 and 0.04 are on either side of one.
             assert_close(&format!("decode at {x}"), decode(x).1, derivative(|h| decode(x + h).0), 1e-6);
             assert_close(&format!("encode at {x}"), encode(x).1, derivative(|h| encode(x + h).0), 1e-6);
         }
