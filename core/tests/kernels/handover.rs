@@ -58,7 +58,7 @@ fn a_run_continues_under_another_water_with_all_else_unchanged() {
     uninterrupted.advance(ITERATIONS).unwrap();
     assert_eq!(uninterrupted.water().unwrap().unwrap().beta_d, other.beta_d);
     let model = uninterrupted.gaussians().unwrap();
-    assert_ne!(model.sh_coeffs, whole.sh_coeffs, "the water changed nothing");
+    assert_ne!(model.sh_coeffs, whole.sh_coeffs, "another water must change the colours");
     let mut resumed = hand_over(other);
     resumed.go_to(&checkpoint).unwrap();
     assert_eq!(resumed.progress().iteration, free + 5);
@@ -71,7 +71,7 @@ fn a_run_continues_under_another_water_with_all_else_unchanged() {
         assert!(matches!(elsewhere.go_to(foreign), Err(CoreError::Checkpoint(_))));
     }
     elsewhere.advance(ITERATIONS).unwrap();
-    assert_same_model("a refused checkpoint changes nothing", &whole, &elsewhere.gaussians().unwrap());
+    assert_same_model("a refused checkpoint must change nothing", &whole, &elsewhere.gaussians().unwrap());
     let foreign = Trainer::hand_over(Arc::clone(&gpu), new(), &checkpoint, Some(with(found)), None);
     assert!(matches!(foreign, Err(CoreError::Checkpoint(_))), "the state of another run");
     let dry = TrainRun { medium: None, ..new() };

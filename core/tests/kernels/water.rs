@@ -58,7 +58,7 @@ pub fn gradients_of<'a>(frame: &'a Frame, blocks: &'a Blocks, slots: &'a wgpu::B
     SplatGradients { frame, blocks, slots, in_bands: false }
 }
 
-/// The nine sums over all rows of `partials`.
+/// Sums over all rows of `partials`, one per water parameter.
 pub fn sums(gpu: &Gpu, partials: &wgpu::Buffer) -> [f64; 9] {
     let rows: Vec<[[f32; 4]; 3]> = gpu.read(partials, 0, (partials.size() / 48) as usize).unwrap();
     std::array::from_fn(|i| rows.iter().map(|row| f64::from(row[i / 3][i % 3])).sum())
