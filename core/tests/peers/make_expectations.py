@@ -9,12 +9,11 @@ lists the conventions that differ.
 
 gsplat (`gsplat/cuda/_torch_impl.py`, called as in its `rendering.py`) computes: covariances from quaternions and
 scales, projection, spherical harmonics, tile lists, alpha, and blending, with nerfacc's products and sums along a ray.
-autograd computes every derivative. This script computes:
+autograd computes every derivative. This script handles:
 
 - The pairs of pixel and Gaussian that are blended. gsplat only has a CUDA kernel for this; `PairsToBlend` applies its
   rule to gsplat's own tile lists. A choice has no derivative, so no gradient comes from this script.
-- The lengths of rays. nerfacc accepts rays of different lengths only on CUDA; `weights_in_rows` passes them to its
-  batched form.
+- Rays of different lengths. nerfacc accepts them only on CUDA; `weights_in_rows` passes them to its batched form.
 - exp of log scales, sigmoid of opacity logits, max(SH + 0.5, 0): one line each, as in all code that calls gsplat.
 - Range. gsplat blends z; here its blending gets the distance from the camera as a fourth channel.
 """

@@ -5,11 +5,11 @@
 
 Our SSIM is that of 3DGS: a window of 11 x 11 with sigma 1.5 whose taps sum to 1, and variances divided by that sum (not
 by n - 1). C1 = 0.01^2 and C2 = 0.03^2 on values of 0..1, each channel on its own, zeros beyond the border, the mean
-over all pixels. The peers have this window and these constants as arguments or defaults. Their border differs: scikit-image
-reflects and leaves 5 pixels out of its mean, torchmetrics reflects and uses all pixels. Here both get the pictures
-inside a frame of 5 black pixels, as wide as the reach of the window, and their map is read inside the frame. Their
-border rules only affect the frame, and no pixel is left out. This script takes the mean inside the frame and applies
-the mask (black in both pictures, not in the mean).
+over all pixels. The peers have this window and these constants as arguments or defaults. Their border differs:
+scikit-image reflects and leaves 5 pixels out of its mean, torchmetrics reflects and uses all pixels. Here both get the
+pictures inside a frame of 5 black pixels, as wide as the reach of the window, and their map is read inside the frame.
+Their border rules only affect the frame, and no pixel is left out. This script takes the mean inside the frame and
+applies the mask (black in both pictures, not in the mean).
 """
 
 import numpy
