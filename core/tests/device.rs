@@ -1,5 +1,5 @@
-//! What happens when a device has no memory left, and when it is lost. A process of its own: one test runs it
-//! again with so little address space that the driver itself refuses.
+//! Devices that run out of memory, and devices that are lost. These tests need their own process: one test
+//! runs it again with so little address space that the driver itself refuses.
 #![expect(clippy::unwrap_used, reason = "the helpers of a test fail by panicking")]
 
 use std::sync::Arc;
@@ -33,9 +33,9 @@ fn allocated(gpu: &Gpu) -> u64 {
     gpu.memory().unwrap().allocated_bytes
 }
 
-/// Need and stock of an error that must be the typed one.
+/// Needed and available bytes of the error, which must be `OutOfMemory`.
 #[track_caller]
-fn need_and_stock(error: CoreError) -> (u64, u64) {
+fn needed_and_available(error: CoreError) -> (u64, u64) {
     match error {
         CoreError::OutOfMemory { needed_bytes: Some(needed), available_bytes: Some(available), .. } => {
             (needed, available)
@@ -45,16 +45,16 @@ fn need_and_stock(error: CoreError) -> (u64, u64) {
 }
 
 #[test]
-fn a_limit_that_was_not_meant_in_bytes_is_refused() {
+fn a_memory_limit_too_small_to_be_in_bytes_is_refused() {
     let options = GpuOptions { allow_cpu: true, memory_limit: Some(8), ..GpuOptions::default() };
     let error = Gpu::new(options).err().unwrap();
-    assert!(matches!(&error, CoreError::Config(said) if said.contains("it is in bytes")), "{error:?}");
+    assert!(matches!(&error, CoreError::Config(message) if message.contains("it is in bytes")), "{error:?}");
 }
 
 #[test]
 fn memory_is_counted_until_the_last_clone_is_dropped() {
-    let Some(gpu) = device_for_test("the ledger of memory") else { return };
-    // wgpu's own first writes are behind.
+    let Some(gpu) = device_for_test("the memory accounting") else { return };
+    // Waits until wgpu has finished its own first writes.
     gpu.release_unused().unwrap();
     let before = gpu.memory().unwrap();
     assert_eq!(before.limit_bytes, None);
@@ -69,12 +69,19 @@ fn memory_is_counted_until_the_last_clone_is_dropped() {
     let read: Vec<u32> = gpu.read(&buffer, 0, 2 * MIB as usize).unwrap();
     assert!(read.iter().all(|&word| word == 0));
     let memory = gpu.memory().unwrap();
-    assert_eq!(memory.allocated_bytes, before.allocated_bytes + with_both, "a read left something behind");
-    assert!(memory.peak_bytes >= memory.allocated_bytes + 8 * MIB, "the peak misses what was read back");
+    assert_eq!(
+        memory.allocated_bytes,
+        before.allocated_bytes + with_both,
+        "a read did not release its memory"
+    );
+    assert!(
+        memory.peak_bytes >= memory.allocated_bytes + 8 * MIB,
+        "the peak does not include the read-back buffer"
+    );
 
     let clone = buffer.clone();
     drop((buffer, uniform));
-    assert!(allocated(&gpu) >= before.allocated_bytes + 10 * MIB, "a clone still lives");
+    assert!(allocated(&gpu) >= before.allocated_bytes + 10 * MIB, "a clone still exists");
     drop(clone);
     assert_eq!(allocated(&gpu), before.allocated_bytes);
     assert!(gpu.memory().unwrap().peak_bytes >= before.allocated_bytes + 18 * MIB);
@@ -83,8 +90,8 @@ fn memory_is_counted_until_the_last_clone_is_dropped() {
 }
 
 #[test]
-fn a_run_that_is_over_gives_all_its_memory_back() {
-    let Some(gpu) = device_for_test("the memory of a run that is over") else { return };
+fn a_finished_run_releases_all_its_memory() {
+    let Some(gpu) = device_for_test("the memory of a finished run") else { return };
     gpu.release_unused().unwrap();
     let before = allocated(&gpu);
     let mut trainer = Trainer::new(Arc::clone(&gpu), run(10_000)).unwrap();
@@ -97,7 +104,7 @@ fn a_run_that_is_over_gives_all_its_memory_back() {
 }
 
 #[test]
-fn the_content_of_writes_waits_in_bounded_memory() {
+fn writes_are_staged_in_bounded_memory() {
     let Some(gpu) = device_for_test("the staging of writes") else { return };
     let content = vec![7_u32; 70 * MIB as usize / 4];
     let buffers = ["first", "second"].map(|label| gpu.buffer(label, 70 * MIB).unwrap());
@@ -113,7 +120,7 @@ fn the_content_of_writes_waits_in_bounded_memory() {
 }
 
 #[test]
-fn allocation_beyond_the_limit_is_a_typed_error_and_the_device_goes_on() {
+fn allocation_beyond_the_limit_fails_and_the_device_survives() {
     let limit = 100 * MIB;
     let Some(gpu) = limited_device_for_test("the limit of memory", Some(limit)) else { return };
     assert_eq!(gpu.memory().unwrap().limit_bytes, Some(limit));
@@ -125,40 +132,40 @@ fn allocation_beyond_the_limit_is_a_typed_error_and_the_device_goes_on() {
         }
     };
     assert_eq!(buffers.len(), 3);
-    let said = error.to_string();
-    assert!(said.contains("has 100.0 MiB") && said.contains("32.0 MiB for many"), "{said}");
-    assert!(said.contains("use more partitions or lower --max-gaussians"), "{said}");
-    let (needed, available) = need_and_stock(error);
+    let message = error.to_string();
+    assert!(message.contains("has 100.0 MiB") && message.contains("32.0 MiB for many"), "{message}");
+    assert!(message.contains("use more partitions or lower --max-gaussians"), "{message}");
+    let (needed, available) = needed_and_available(error);
     assert_eq!((needed, available), (allocated(&gpu) + 32 * MIB, limit));
     assert!(gpu.memory().unwrap().peak_bytes <= limit);
 
-    // What reads and writes need besides counts too, and they fail as softly.
-    need_and_stock(gpu.read::<u32>(&buffers[0], 0, 8 * MIB as usize).unwrap_err());
+    // The staging memory of reads and writes counts as well, and they fail with the same error.
+    needed_and_available(gpu.read::<u32>(&buffers[0], 0, 8 * MIB as usize).unwrap_err());
     gpu.write(&buffers[0], 0, &vec![9_u32; 2 * MIB as usize]);
-    need_and_stock(gpu.check().unwrap_err());
+    needed_and_available(gpu.check().unwrap_err());
     gpu.check().unwrap();
-    assert_eq!(gpu.read::<u32>(&buffers[0], 0, 4).unwrap(), [0; 4], "a write that was refused was made");
+    assert_eq!(gpu.read::<u32>(&buffers[0], 0, 4).unwrap(), [0; 4], "a refused write must not take effect");
 
-    // A uniform cannot be refused on the spot: the next look says so.
+    // A uniform cannot be refused at once; the next check reports the error.
     let rest = limit - allocated(&gpu) - MIB / 2;
     buffers.push(gpu.buffer("rest", rest).unwrap());
     let uniforms: Vec<wgpu::Buffer> = (0..9).map(|_| gpu.uniform("large", &[0_u32; 16_384])).collect();
-    need_and_stock(gpu.check().unwrap_err());
+    needed_and_available(gpu.check().unwrap_err());
     drop((buffers, uniforms));
 
-    // A run that does not fit, then one that does, on the same device.
-    need_and_stock(Trainer::new(Arc::clone(&gpu), run(300_000)).err().unwrap());
+    // A run that does not fit, then one that fits, on the same device.
+    needed_and_available(Trainer::new(Arc::clone(&gpu), run(300_000)).err().unwrap());
     let mut trainer = Trainer::new(Arc::clone(&gpu), run(300)).unwrap();
     assert!(trainer.advance(3).unwrap().loss.is_finite());
 }
 
 #[test]
-fn photographs_on_the_device_give_way_to_what_a_run_needs_and_change_no_byte() {
+fn cached_photographs_make_room_for_a_run_and_change_no_byte() {
     const SIZE: u32 = 256;
     const VIEWS: u64 = 12;
     let photographs = VIEWS * u64::from(4 * SIZE * SIZE);
     let train = |limit: Option<u64>| -> Option<(Vec<u8>, u64)> {
-        let gpu = limited_device_for_test("photographs that give way", limit)?;
+        let gpu = limited_device_for_test("photographs that make room", limit)?;
         let (camera, pose) = off_centre_view(SIZE, SIZE, 3.0);
         let view = TrainView { name: "grey".into(), camera, pose, clear_range: 0.0 };
         let mut run = run(300);
@@ -172,53 +179,53 @@ fn photographs_on_the_device_give_way_to_what_a_run_needs_and_change_no_byte() {
     let limit = peak - photographs / 2;
     let (short, short_peak) = train(Some(limit)).unwrap();
     assert!(short_peak <= limit, "{short_peak} bytes of {limit}");
-    assert!(short == ample, "what is kept on the device has changed the run");
+    assert!(short == ample, "photographs kept on the device changed the run");
 }
 
 #[test]
-fn memory_that_only_the_device_still_holds_is_not_missing() {
-    let Some(gpu) = limited_device_for_test("memory that is given back late", Some(100 * MIB)) else {
+fn memory_of_dropped_buffers_is_released_before_an_error() {
+    let Some(gpu) = limited_device_for_test("memory that is released late", Some(100 * MIB)) else {
         return;
     };
-    // The bind groups of a renderer that is gone keep its buffers.
+    // The bind groups of a dropped renderer keep its buffers.
     let (camera, pose) = off_centre_view(640, 480, 3.0);
     let mut renderer = Renderer::new(Arc::clone(&gpu), &random(6, 1000, 3)).unwrap();
     renderer.render(&camera, &pose, [0.0; 3]).unwrap();
     drop(renderer);
     let kept = allocated(&gpu);
-    assert!(kept > 3 * MIB, "{kept} bytes: nothing is kept, so this proves nothing");
+    assert!(kept > 3 * MIB, "{kept} bytes: no buffers are kept, so this test proves nothing");
     assert!(gpu.buffer("nearly all", 98 * MIB).is_ok());
 }
 
-/// The driver's own refusal, through wgpu's error scope: in a process with little address space lavapipe
-/// finds none.
+/// The driver's own refusal, through wgpu's error scope: lavapipe finds no memory in a process with little
+/// address space.
 #[cfg(target_os = "linux")]
 #[test]
-fn a_driver_without_memory_is_a_typed_error_and_the_device_goes_on() {
+fn a_driver_without_memory_fails_and_the_device_survives() {
     const CHILD: &str = "FATHOM_TEST_LITTLE_MEMORY";
     if std::env::var_os(CHILD).is_some() {
         return without_memory(&device_for_test("a driver without memory").unwrap());
     }
     let Some(gpu) = device_for_test("a driver without memory") else { return };
     if !gpu.adapter().is_cpu {
-        // The memory of a real GPU is not the process's address space.
+        // The memory of a real GPU is not in the address space of the process.
         return;
     }
     let tests = std::env::current_exe().unwrap();
-    let this = "a_driver_without_memory_is_a_typed_error_and_the_device_goes_on";
+    let this = "a_driver_without_memory_fails_and_the_device_survives";
     let output = std::process::Command::new("sh")
         .args(["-c", "ulimit -v 4194304 && exec \"$0\" --exact \"$1\" --nocapture"])
         .arg(tests)
         .arg(this)
-        // Address space by the number of cores would leave more or less for the test.
+        // Fixed numbers, because address space that depends on the number of cores would change the test.
         .envs([(CHILD, "1"), ("LP_NUM_THREADS", "2"), ("MALLOC_ARENA_MAX", "2")])
         .output()
         .unwrap();
-    let said =
+    let message =
         [output.stdout, output.stderr].map(|bytes| String::from_utf8_lossy(&bytes).into_owned()).concat();
-    assert!(output.status.success(), "{}: {said}", output.status);
-    assert!(said.contains("the driver refused 128.0 MiB for many"), "{said}");
-    assert!(said.contains("1 passed") && !said.contains("panicked"), "{said}");
+    assert!(output.status.success(), "{}: {message}", output.status);
+    assert!(message.contains("the driver refused 128.0 MiB for many"), "{message}");
+    assert!(message.contains("1 passed") && !message.contains("panicked"), "{message}");
 }
 
 #[cfg(target_os = "linux")]
@@ -232,12 +239,12 @@ fn without_memory(gpu: &Arc<Gpu>) {
                 Ok(buffer) => buffers.push(buffer),
                 Err(error) => return (buffers, error),
             }
-            assert!(buffers.len() < 100, "nothing is ever refused");
+            assert!(buffers.len() < 100, "no allocation was refused");
         }
     };
     let (buffers, error) = until_refused(128 * MIB);
     println!("{error}");
-    let (needed, available) = need_and_stock(error);
+    let (needed, available) = needed_and_available(error);
     assert_eq!((needed, available), (allocated(gpu) + 128 * MIB, allocated(gpu)));
     assert!(available >= buffers.len() as u64 * 128 * MIB && buffers.len() > 4);
     drop(buffers);
@@ -245,7 +252,7 @@ fn without_memory(gpu: &Arc<Gpu>) {
     assert!(trainer.advance(3).unwrap().loss.is_finite());
     drop(trainer);
 
-    // A write for which wgpu has no staging buffer loses the device: an error as well, and the right one.
+    // A write loses the device when wgpu has no staging buffer for it. It must report the same error.
     let (_large, _) = until_refused(128 * MIB);
     let (_small, _) = until_refused(32 * MIB);
     gpu.write(&target, 0, &content);
@@ -255,7 +262,7 @@ fn without_memory(gpu: &Arc<Gpu>) {
 }
 
 #[test]
-fn a_lost_device_is_a_typed_error_whatever_is_asked_of_it_first() {
+fn a_lost_device_is_a_typed_error_in_every_call() {
     type Case = (&'static str, fn(&Arc<Gpu>, &wgpu::Buffer, &mut Trainer) -> fathom_core::Result<()>);
     let cases: [Case; 10] = [
         ("buffer", |gpu, _, _| gpu.buffer("late", 64).map(drop).and(gpu.wait())),
@@ -272,7 +279,7 @@ fn a_lost_device_is_a_typed_error_whatever_is_asked_of_it_first() {
         ("memory", |gpu, _, _| {
             gpu.reset_peak();
             gpu.memory();
-            // These look without waiting: a loss may show later.
+            // These calls do not wait, so the loss may be reported later.
             gpu.wait()
         }),
         ("render", |gpu, _, _| {
@@ -290,7 +297,7 @@ fn a_lost_device_is_a_typed_error_whatever_is_asked_of_it_first() {
             let buffer = gpu.buffer("early", 64).unwrap();
             let mut trainer = Trainer::new(Arc::clone(&gpu), run(300)).unwrap();
             if warm {
-                // Else stages are compiled on the lost device.
+                // Otherwise kernels are compiled on the lost device.
                 trainer.advance(1).unwrap();
             }
             gpu.device().destroy();
@@ -303,7 +310,7 @@ fn a_lost_device_is_a_typed_error_whatever_is_asked_of_it_first() {
 }
 
 #[test]
-fn a_device_that_is_lost_in_the_middle_of_a_run_ends_it_with_an_error() {
+fn losing_the_device_ends_a_run_with_an_error() {
     let Some(gpu) = device_for_test("a device lost in a run") else { return };
     let mut trainer = Trainer::new(Arc::clone(&gpu), run(300)).unwrap();
     trainer.advance(1).unwrap();

@@ -1,4 +1,4 @@
-//! The forecast of `fathom_core::memory` against what wgpu's allocator reports of real runs.
+//! The forecast of `fathom_core::memory` against the memory of real runs, as reported by wgpu's allocator.
 
 use std::sync::Arc;
 
@@ -63,7 +63,7 @@ impl Case {
             .collect()
     }
 
-    /// A floor with some relief, of Gaussians as wide as they are apart.
+    /// A floor with some relief. Its Gaussians are as wide as their spacing.
     fn model(&self, seed: u32, count: u32) -> Gaussians {
         let mut model = random(seed, count as usize, self.sh_degree);
         model.means.iter_mut().for_each(|mean| mean[1] *= 0.05);
@@ -77,7 +77,7 @@ impl Case {
             config: self.config(),
             extent: 3.0,
             views: Arc::new(grey(self.views())),
-            // The rest of the cap is filled on the way.
+            // Density control fills the rest of the cap.
             focus: self.model(5, self.trained / 2),
             context: self.model(6, self.frozen),
             surfaces: Gaussians::empty(self.config().sh_degree),
@@ -85,7 +85,7 @@ impl Case {
         }
     }
 
-    /// What a coordinator would say, which knows points but no Gaussians.
+    /// The forecast of a coordinator, which has points but no Gaussians.
     fn forecast(&self, gpu: &Gpu) -> MemoryForecast {
         let (config, water) = (self.config(), self.water_config());
         let views = self.views();
@@ -109,7 +109,7 @@ impl Case {
     }
 }
 
-/// Five sizes; from high above all is seen, from near a part.
+/// Five sizes. High cameras see the whole floor, near ones a part.
 const CASES: [Case; 5] = {
     use Moments::{Compact, F32};
     let base = Case {
@@ -153,9 +153,9 @@ const CASES: [Case; 5] = {
 };
 
 #[test]
-fn the_forecast_is_within_15_percent_of_the_peak_over_five_sizes() {
+fn the_forecast_is_within_15_percent_of_five_measured_peaks() {
     for case in CASES {
-        // A device each: what others left in its caches would count.
+        // One device per case, because memory in the caches of earlier cases would count.
         let Some(gpu) = device_for_test("the forecast of memory") else { return };
         let before = gpu.memory().unwrap().allocated_bytes;
         gpu.reset_peak();
@@ -178,7 +178,7 @@ fn the_forecast_is_within_15_percent_of_the_peak_over_five_sizes() {
 }
 
 #[test]
-fn the_sizes_are_those_of_the_buffers() {
+fn the_forecast_sizes_match_the_buffers() {
     for case in CASES {
         let Some(gpu) = device_for_test("the sizes of buffers") else { return };
         let mut trainer = Trainer::new(Arc::clone(&gpu), case.run()).unwrap();
@@ -207,7 +207,7 @@ fn the_sizes_are_those_of_the_buffers() {
         let pixels = u64::from(case.size[0] * case.size[1]);
         let gaussians = trained * memory::trained_bytes(case.sh_degree, case.moments)
             + frozen * memory::frozen_bytes(case.sh_degree);
-        for (what, told, taken) in [
+        for (what, forecast, taken) in [
             ("Gaussians", gaussians, used.gaussians),
             ("flags", (trained + frozen) * memory::FLAG_BYTES, of(&["visible flags"])),
             ("visible", u64::from(visible) * memory::VISIBLE_BYTES, used.per_visible),
@@ -219,9 +219,13 @@ fn the_sizes_are_those_of_the_buffers() {
                 of(&by_pixel),
             ),
         ] {
-            // Histograms, and ends of buffers up to the driver's alignment.
-            let most = told + told / 100 + 2048;
-            assert!((told..=most).contains(&taken), "{what} of {}: {told} told, {taken} taken", case.trained);
+            // Room for histograms, and for the driver's alignment of buffers.
+            let most = forecast + forecast / 100 + 2048;
+            assert!(
+                (forecast..=most).contains(&taken),
+                "{what} of {}: {forecast} forecast, {taken} taken",
+                case.trained
+            );
         }
     }
 }

@@ -1,4 +1,4 @@
-//! What a long run takes in memory. A process of its own: resident memory is that of all its threads.
+//! The memory of a long run. It needs its own process, because resident memory includes all threads.
 #![cfg(target_os = "linux")]
 #![expect(clippy::unwrap_used, reason = "the helpers of a test fail by panicking")]
 
@@ -16,22 +16,21 @@ fn resident_mib() -> f64 {
     pages.split(' ').nth(1).unwrap().parse::<f64>().unwrap() * 4096.0 / f64::from(1 << 20)
 }
 
-/// On lavapipe a branch that hangs on a uniform alone costs a copy of its stage at every dispatch, never
-/// given back (see `veiled` in shaders/shared/frame.wgsl): 0.3 MiB and more an iteration, 60 over the 200
-/// that are measured here.
+/// On lavapipe, a branch that depends only on a uniform costs a copy of its kernel at every dispatch (see
+/// `veiled` in shaders/shared/frame.wgsl). The copies are never released: at least 0.3 MiB per iteration, 60
+/// MiB over the 200 iterations measured here.
 #[test]
-fn a_run_does_not_grow_with_its_iterations() {
+fn memory_does_not_grow_with_the_iterations_of_a_run() {
     let Some(gpu) = device_for_test("the memory of a long run") else { return };
     let (camera, pose) = off_centre_view(64, 48, 3.0);
     let views = vec![TrainView { name: "grey".into(), camera, pose, clear_range: 0.0 }];
-    // A quarter of the run is behind before memory is looked at, so that lists, caches and compiled stages
-    // are there.
+    // Memory is measured after a quarter of the run, when lists, caches and compiled kernels exist.
     let config = TrainConfig {
         iterations: 400,
         max_gaussians: 300,
         sh_degree_at: [0.0; 3],
         refine_steps: 0,
-        // All stages that an iteration may have.
+        // Exposure adds its kernels to every iteration.
         exposure: true,
         ..TrainConfig::default()
     };

@@ -1,6 +1,5 @@
-//! Real scenes by other programs: COLMAP, 3DGS, photographs from cameras. They lie outside the repository, in
-//! `$FATHOM_SCENES` or `../shared/scenes` beside the workspace; where they do not, each test says that it was
-//! skipped.
+//! Real scenes from other programs: COLMAP, 3DGS, photographs from cameras. They are not in the repository;
+//! `FATHOM_SCENES` names their folder. A test whose scene is missing reports that it was skipped.
 
 #![expect(clippy::unwrap_used, reason = "a test may panic")]
 
@@ -53,8 +52,8 @@ fn photographs_with_their_model_are_read_for_training() {
             assert!(view.pose.is_sound());
         }
         assert_eq!(Points::from_bytes(&scene.points.to_bytes()).unwrap(), scene.points);
-        // Most points are seen by some camera in front of it: an inverted pose or a swapped axis would fail
-        // this.
+        // Most points must lie in front of some camera and in its picture. An inverted pose or a swapped axis
+        // would fail this.
         let cameras: Vec<_> = scene
             .views
             .iter()
@@ -76,7 +75,7 @@ fn photographs_with_their_model_are_read_for_training() {
 }
 
 #[test]
-fn a_first_photograph_of_each_scene_is_prepared_at_training_size() {
+fn the_first_photograph_of_each_scene_is_prepared_for_training() {
     for name in ["fox", "reef-clip", "sesa-wreck", "sceaux"] {
         let Some(path) = real_scene_for_test(name) else { continue };
         let scene = load(&path, Purpose::Train);
@@ -90,7 +89,7 @@ fn a_first_photograph_of_each_scene_is_prepared_at_training_size() {
         assert_eq!(small.width.max(small.height), 240);
         assert_eq!(image.pixels.len(), (small.width * small.height) as usize);
         assert_eq!(image.kept_share(), 1.0);
-        // Half a photograph is no photograph.
+        // Half a photograph must be refused.
         let torn = Photograph { image: &bytes[..bytes.len() / 2], ..photograph };
         let message = picture::prepare(&torn, camera, MaskKeep::White, 240).unwrap_err().to_string();
         assert!(message.contains(&view.name) && message.contains("truncated"), "{message}");
@@ -98,11 +97,11 @@ fn a_first_photograph_of_each_scene_is_prepared_at_training_size() {
 }
 
 #[test]
-fn the_binary_and_the_text_model_of_one_reconstruction_have_the_same_poses() {
+fn binary_and_text_models_of_one_scene_have_the_same_poses() {
     let Some(path) = real_scene_for_test("sceaux") else { return };
     let binary = load(&path, Purpose::Inspect);
-    // The text model belongs to the photographs before undistortion: its one camera is larger and has radial
-    // distortion, its poses are the same ones with six digits.
+    // The text model belongs to the photographs before undistortion. Its only camera is larger and has radial
+    // distortion; its poses are the same with six digits.
     let text = load(&path.join("text_model"), Purpose::Inspect);
     assert_eq!((binary.source, text.source), ("COLMAP binary", "COLMAP text"));
     assert_eq!(text.cameras.len(), 1);
@@ -117,7 +116,7 @@ fn the_binary_and_the_text_model_of_one_reconstruction_have_the_same_poses() {
         let moved = a.pose.centre().distance(b.pose.centre());
         assert!(moved < 1e-4, "{}: moved by {moved}", a.name);
     }
-    // Training on pictures of another size than the cameras is refused.
+    // Training is refused when pictures and cameras differ in size.
     let error = load_scene(&path.join("text_model"), Purpose::Train, &DataConfig::default()).unwrap_err();
     assert!(error.to_string().contains("1000x737, but its camera is 2832x2128"), "{error}");
 }
@@ -130,8 +129,8 @@ fn a_text_model_with_a_camera_for_each_image_is_read() {
     assert_eq!(scene.views.len(), 11);
     let ids: std::collections::BTreeSet<u32> = scene.views.iter().map(|view| view.camera_id).collect();
     assert_eq!(ids.len(), 11);
-    // Another run of the same photographs: not the poses of the other models, but the same shape. Distances
-    // between camera centres agree up to one scale.
+    // Another reconstruction of the same photographs: its poses differ from the other models, but its shape
+    // is the same. Distances between camera centres agree up to one scale.
     let other = load(&path, Purpose::Inspect);
     let centres = |scene: &Scene| -> BTreeMap<String, glam::DVec3> {
         scene.views.iter().map(|view| (view.name.clone(), view.pose.centre())).collect()
@@ -149,7 +148,7 @@ fn a_text_model_with_a_camera_for_each_image_is_read() {
 }
 
 #[test]
-fn thousands_of_poses_without_pictures_are_inspected_in_well_under_a_second() {
+fn thousands_of_poses_are_inspected_in_under_a_second() {
     for (name, views, points) in
         [("auv", 4736, true), ("kitti", 4541, false), ("street-cameras.json", 1499, false)]
     {
@@ -169,7 +168,7 @@ fn thousands_of_poses_without_pictures_are_inspected_in_well_under_a_second() {
 }
 
 #[test]
-fn a_model_by_another_program_is_read_and_written_back_to_the_same_numbers() {
+fn a_model_by_another_program_survives_a_round_trip() {
     let Some(path) = real_scene_for_test("splats/kacytran_iteration7000.ply") else { return };
     let model = ply::read_model(&path).unwrap();
     assert_eq!((model.len(), model.sh_degree), (9080, 3));
@@ -186,7 +185,7 @@ fn a_model_by_another_program_is_read_and_written_back_to_the_same_numbers() {
         let worst = (0..4).map(|i| (new[i] * norm - old[i]).abs()).fold(0.0, f32::max);
         assert!(worst <= 1e-6 * norm, "quaternion {index}: {new:?} for {old:?}");
     }
-    // Row by row, the bytes are those of the file.
+    // Row by row, the bytes equal those of the file.
     let bytes = std::fs::read(&path).unwrap();
     let mut reader = ply::SplatReader::open(&path).unwrap();
     let (row_bytes, mut rows) = (reader.layout().row_bytes(), 0);
@@ -201,7 +200,7 @@ fn a_model_by_another_program_is_read_and_written_back_to_the_same_numbers() {
 }
 
 #[test]
-fn the_baselines_on_the_wreck_are_those_that_are_known() {
+fn the_baselines_on_the_wreck_have_their_known_psnr() {
     let Some(path) = real_scene_for_test("sesa-wreck") else { return };
     let scene = load(&path, Purpose::Train);
     let (mut flat, mut blurred, mut count) = (0.0, 0.0, 0.0);

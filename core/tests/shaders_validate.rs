@@ -1,4 +1,4 @@
-//! Every shader is valid WGSL for every layout of tiles that an adapter may get. Needs no GPU.
+//! Checks that every shader is valid WGSL for every tile layout. Needs no GPU.
 #![cfg(feature = "gpu")]
 
 use std::collections::BTreeSet;
@@ -14,8 +14,8 @@ fn shaders_validate() {
             let source = shader_source(name, layout).expect("the stage and its imports are there");
             let module = naga::front::wgsl::parse_str(&source)
                 .unwrap_or_else(|error| panic!("{name}, {layout:?}: {}", error.emit_to_string(&source)));
-            // No optional capability where the layout does not stand for one: it would not run on every
-            // adapter.
+            // Optional capabilities are only allowed in layouts that need them; other shaders must run on
+            // every adapter.
             let mut capabilities = Capabilities::empty();
             capabilities
                 .set(Capabilities::SUBGROUP, layout.needs_subgroups() || name.ends_with("_subgroups"));

@@ -1,8 +1,8 @@
-//! Hostile input for every reader of this crate: `fathom_fuzz` says how it runs, how long, and how a finding
-//! is replayed.
+//! Hostile input for every reader of this crate. `fathom_fuzz` explains how targets run, how long, and how to
+//! replay a finding.
 //!
-//! A target reads as the program does, and what is taken must be sound: a number that is not finite, or so
-//! large that its square is none, is a finding as a panic is.
+//! A target reads its input as the program does, and accepted input must be sound. A panic is a finding. So
+//! is a number that is not finite, or whose square is not finite.
 #![expect(clippy::unwrap_used, reason = "a target fails by panicking")]
 
 mod models;
@@ -13,7 +13,7 @@ mod texts;
 #[global_allocator]
 static ALLOCATOR: fathom_fuzz::Counting = fathom_fuzz::Counting;
 
-/// Little-endian bytes in the making.
+/// Builds a sequence of little-endian bytes.
 #[derive(Clone, Default)]
 pub struct Bytes(pub Vec<u8>);
 

@@ -1,4 +1,4 @@
-//! Models and what of them travels as bytes: PLY, sparse points, the state of a network.
+//! Models and their parts that are sent as bytes: PLY, sparse points, the state of a network.
 
 use fathom_core::gaussians::Gaussians;
 use fathom_core::nets::{RELEASE_PRIOR, WaterParamNet, WaterParamPredictor};
@@ -60,7 +60,7 @@ fn model(sh_degree: u8) -> Gaussians {
 }
 
 #[test]
-fn fuzzed_models_are_read_or_refused_and_written_as_they_were_read() {
+fn fuzzed_models_are_refused_or_survive_a_round_trip() {
     let comments = [water_record().to_comment().unwrap(), ply::ANTIALIASED.to_owned()];
     let mut corpus = vec![
         ply::to_bytes(&model(1), &comments).unwrap(),
@@ -75,7 +75,7 @@ fn fuzzed_models_are_read_or_refused_and_written_as_they_were_read() {
     let folder = Folder::new("model");
     let read = |bytes: &[u8]| {
         let path = folder.put("model.ply", bytes);
-        // As the coordinator looks at the header of a model, and the renderer too.
+        // The coordinator and the renderer read the header of a model in this way.
         let (record, _) = (ply::water_record(&path), ply::is_antialiased(&path));
         if let Ok(Some(record)) = &record {
             assert!(record.water().is_physical());
@@ -116,10 +116,10 @@ fn fuzzed_sparse_points_are_read_or_refused_and_have_one_form() {
 }
 
 #[test]
-fn a_fuzzed_state_of_a_network_is_taken_or_refused() {
+fn a_fuzzed_state_of_a_network_is_accepted_or_refused() {
     let network = || WaterParamNet::new(8, RELEASE_PRIOR.to_raw(1.0), 7).unwrap();
     let sound = network().to_bytes();
-    // The digest at the end made right again: whoever changes the rest can do so too.
+    // Corrects the digest at the end, as an attacker who changes the content can.
     fn mend(bytes: &mut [u8]) {
         if let Some((content, digest)) = bytes.split_last_chunk_mut::<32>() {
             *digest = *blake3::hash(content).as_bytes();

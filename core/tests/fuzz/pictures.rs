@@ -1,4 +1,4 @@
-//! Photographs and masks, by the function that workers decode them with.
+//! Photographs and masks, decoded with the function that workers use.
 
 use fathom_core::config::MaskKeep;
 use fathom_core::picture::{self, Photograph};
@@ -10,10 +10,10 @@ use crate::Bytes;
 
 const WIDTH: u32 = 9;
 const HEIGHT: u32 = 7;
-/// What a decoder is told that it may take beside the picture.
+/// Memory that a decoder may use in addition to the picture.
 const DECODER_BYTES: u64 = 64 << 20;
-/// Pictures that say they are larger are decoded only against a camera of another size: one that is as large
-/// as it says takes the memory that it says, up to the limit that has a test of its own.
+/// Pictures whose header names more pixels are only decoded against a camera of another size. Otherwise they
+/// would take the memory for that many pixels, up to a limit that another test checks.
 const MOST_PIXELS: u64 = 1 << 16;
 
 fn camera((width, height): (u32, u32)) -> Camera {
@@ -42,8 +42,8 @@ fn jpeg(colour: ExtendedColorType) -> Vec<u8> {
     jpeg
 }
 
-/// A grey one of 8 x 8 in two scans. Its Huffman tables are those of the standard, as the encoder writes
-/// them: 00 ends at once for a DC coefficient, 1010 ends a block of AC coefficients.
+/// A grey JPEG of 8 x 8 in two scans. It has the standard Huffman tables, which the encoder writes: 00 is a
+/// DC coefficient without bits, 1010 ends a block of AC coefficients.
 fn progressive_jpeg() -> Vec<u8> {
     let whole = jpeg(ExtendedColorType::L8);
     let scan = whole.windows(2).position(|pair| pair == [0xff, 0xda]).unwrap();
@@ -60,11 +60,11 @@ fn progressive_jpeg() -> Vec<u8> {
     [&head, &scans.concat()[..]].concat()
 }
 
-/// Rows of RGB in one strip, under `compression` of TIFF 6.0, with a horizontal predictor where it takes one.
+/// Rows of RGB in one strip with this compression of TIFF 6.0.
 fn tiff(compression: u16) -> Vec<u8> {
     let pixels = samples(3);
     let strip = match compression {
-        // LZW: each sample a code of 9 bits, the table cleared before it would need ten.
+        // LZW: each sample is a code of 9 bits; the table is cleared before codes need 10.
         5 => {
             let codes = pixels
                 .chunks(200)
@@ -79,7 +79,7 @@ fn tiff(compression: u16) -> Vec<u8> {
                 })
                 .collect()
         }
-        // Deflate: one stored block and the checksum of it.
+        // Deflate: one stored block and its checksum.
         8 => {
             let (mut a, mut b) = (1_u32, 0_u32);
             for byte in &pixels {
@@ -93,7 +93,7 @@ fn tiff(compression: u16) -> Vec<u8> {
         32_773 => pixels.chunks(128).flat_map(|chunk| [&[chunk.len() as u8 - 1], chunk].concat()).collect(),
         _ => pixels,
     };
-    // Header, strip, then the directory; the bits of three samples lie before it.
+    // Header, strip, bits of the three samples, then the directory.
     let bits_at = 8 + strip.len() as u32 + strip.len() as u32 % 2;
     let fields: [(u16, u16, u32, u32); 9] = [
         (256, 4, 1, WIDTH),
@@ -115,7 +115,7 @@ fn tiff(compression: u16) -> Vec<u8> {
     tiff.u32(0).0
 }
 
-/// Makes the checksums of a PNG's chunks right.
+/// Corrects the checksums of the chunks of a PNG.
 fn mend_png(png: &mut [u8]) {
     let mut at = 8;
     while let Some(head) = png.get(at..at + 8) {
@@ -136,11 +136,11 @@ fn crc32(bytes: &[u8]) -> u32 {
 fn photographs(name: &str, corpus: Vec<Vec<u8>>, mend: Option<fn(&mut [u8])>) {
     let folder = Folder::new(name);
     let read = |bytes: &[u8]| {
-        // As at ingest, by the header alone.
+        // As at ingest: only the header is read.
         let path = folder.put("photograph", bytes);
         let (size, complete) = (picture::dimensions(&path), picture::dimensions_of_complete(&path));
         assert!(size.is_ok() || complete.is_err());
-        // Then as a worker does, where the picture has the size that the header says.
+        // Then as in a worker, with a camera of the size in the header.
         let expected = size.ok().filter(|(w, h)| u64::from(*w) * u64::from(*h) <= MOST_PIXELS);
         let camera = camera(expected.unwrap_or((WIDTH, HEIGHT)));
         let photograph = Photograph { name: "photograph", image: bytes, mask: None };
@@ -171,7 +171,7 @@ fn fuzzed_tiffs_are_decoded_or_refused() {
 }
 
 #[test]
-fn fuzzed_masks_are_laid_over_a_photograph_or_refused() {
+fn fuzzed_masks_are_applied_to_a_photograph_or_refused() {
     let photograph = png(ExtendedColorType::Rgb8);
     let camera = camera((WIDTH, HEIGHT));
     let read = |bytes: &[u8]| {

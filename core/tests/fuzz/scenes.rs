@@ -1,4 +1,4 @@
-//! Scenes: COLMAP in both forms, nerfstudio, the cameras of 3DGS, clouds of points.
+//! Scenes: COLMAP as binary and text, nerfstudio, the cameras of 3DGS, point clouds.
 
 use fathom_core::config::DataConfig;
 use fathom_core::scene::{CameraPath, Purpose, Scene, load_scene};
@@ -6,10 +6,10 @@ use fathom_fuzz::{Folder, Target, run};
 
 use crate::Bytes;
 
-/// Far beyond any scene, and its square still is an f32: see `MAX_COORDINATE` in `core::scene`.
+/// Far beyond any scene, but its square still fits an f32: see `MAX_COORDINATE` in `core::scene`.
 const FAR: f64 = 1e13;
 
-/// Everything that the program does with a scene before it looks at a photograph.
+/// Everything that the program does with a scene before it reads a photograph.
 fn use_scene(scene: &Scene) {
     for camera in &scene.cameras {
         assert!(camera.params.iter().all(|value| value.is_finite()), "{camera:?}");
@@ -74,7 +74,7 @@ const IMAGES_TXT: &str = "# Image list\n1 0.9 0.1 -0.2 0.3 1 -2 0.5 1 a.png\n1.5
 const POINTS_TXT: &str =
     "# 3D points\n1 1 0.25 3 10 20 30 0.5 1 0\n2 2 0.25 3 10 20 30 0.5 1 0 9 1\n3 3 1e-1 3 0 0 255 0.5\n";
 
-/// A COLMAP model of which one file is the input.
+/// A COLMAP model with the fuzzed input as one of its files.
 fn colmap(test: &str, hostile: &str, words: &[&str]) {
     let folder = Folder::new(test);
     let binary = hostile.ends_with(".bin");

@@ -1,4 +1,4 @@
-//! JSON that travels: manifests, configurations, waters, reports.
+//! JSON that is sent between programs: manifests, configurations, waters, reports.
 
 use fathom_core::config::{Composition, JobConfig, Preset};
 use fathom_core::scene::{BlobRef, Camera, CameraModel, Manifest, ManifestView, Pose};
@@ -6,7 +6,7 @@ use fathom_core::seams::SeamReport;
 use fathom_core::water::{Consensus, PartitionEvidence, StandardErrors, Water, WaterRecord, consensus};
 use fathom_fuzz::{Target, run};
 
-/// The water of a model's header.
+/// The water in the header of a model.
 pub fn water_record() -> WaterRecord {
     let errors = StandardErrors::from_array([0.01; 9]);
     WaterRecord::new(&Water::COASTAL, Composition::PixelsSrgb, errors, "sparse", 0.5)
@@ -31,7 +31,7 @@ fn manifest() -> Manifest {
 }
 
 #[test]
-fn fuzzed_manifests_are_read_or_refused_and_name_nothing_outside() {
+fn fuzzed_manifests_are_refused_or_name_nothing_outside() {
     let read = |bytes: &[u8]| {
         let Ok(manifest) = Manifest::from_json(bytes) else { return false };
         for view in &manifest.views {
@@ -48,7 +48,7 @@ fn fuzzed_manifests_are_read_or_refused_and_name_nothing_outside() {
 }
 
 #[test]
-fn fuzzed_configurations_are_read_or_refused_and_survive_the_store() {
+fn fuzzed_configurations_are_refused_or_survive_the_store() {
     let whole = |preset| serde_json::to_vec(&JobConfig::of_preset(preset)).unwrap();
     let corpus = vec![
         br#"{"preset": "paper", "train": {"iterations": 7000, "ssim_weight": 0.3}, "partition": {"columns": 2}}"#.to_vec(),
@@ -62,7 +62,7 @@ fn fuzzed_configurations_are_read_or_refused_and_survive_the_store() {
         if config.validate().is_err() {
             return false;
         }
-        // A stored job is read again by the scheduler and by workers.
+        // The scheduler and workers read a stored job again.
         let stored = serde_json::to_string(&config).unwrap();
         assert_eq!(JobConfig::from_json(&stored).unwrap(), config);
         assert_eq!(serde_json::from_str::<JobConfig>(&stored).unwrap(), config);
@@ -86,8 +86,8 @@ fn fuzzed_waters_are_read_or_refused_and_are_physical() {
     };
     run(&Target::new("water of a model", corpus, &read));
 
-    let gave = |partition| PartitionEvidence { partition, water: Water::COASTAL, evidence: [2.0; 9] };
-    let found = consensus(&water_record(), 5.0, &[gave(0), gave(1), gave(2)]).unwrap();
+    let of = |partition| PartitionEvidence { partition, water: Water::COASTAL, evidence: [2.0; 9] };
+    let found = consensus(&water_record(), 5.0, &[of(0), of(1), of(2)]).unwrap();
     let read = |bytes: &[u8]| {
         Consensus::from_json(bytes).inspect(|read| assert!(read.water.water().is_physical())).is_ok()
     };

@@ -1,4 +1,4 @@
-//! Steps: the device against the twin, over several, on the same gradients.
+//! Several optimiser steps on the device against the twin, with the same gradients.
 
 use fathom_core::config::Moments;
 use fathom_core::gaussians::Gaussians;
@@ -39,7 +39,7 @@ fn opacity(logit: f64) -> f64 {
     1.0 / (1.0 + (-logit).exp())
 }
 
-/// Raw gradients of a model in the view of `scene`, and who is seen.
+/// Raw gradients of a model in the view of `scene`, and which Gaussians are visible.
 fn gradients(
     gpu: &std::sync::Arc<fathom_core::gpu::Gpu>,
     scene: &Scene,
@@ -52,7 +52,7 @@ fn gradients(
     (view.parameter_gradients(), seen)
 }
 
-/// Steps on the device with the model on it, `count` times; the twin gets the device's gradients before each.
+/// Takes `count` steps on the device; before each, the twin gets the gradients of the device.
 fn compare(
     name: &str,
     scene: &Scene,
@@ -63,7 +63,7 @@ fn compare(
     compare_at_least(name, scene, step, count, 1000, regularise);
 }
 
-/// The same; at least so many numbers must have been compared.
+/// The same; more than `least` numbers must have been compared.
 fn compare_at_least(
     name: &str,
     scene: &Scene,
@@ -88,7 +88,7 @@ fn compare_kind(
 ) {
     let Some(gpu) = device() else { return };
     let mut view = View::render_with(&gpu, scene, moments);
-    // Rubbish that no Gaussian may take for its own before its first step.
+    // Rubbish that no Gaussian may read before its first step.
     let (_, _, training) = view.blocks.trainable().next().unwrap();
     poison(&gpu, &training.moments);
     poison(&gpu, &training.sh_moment1);
@@ -116,8 +116,8 @@ fn compare_kind(
         for index in (0..kernel.len()).filter(|&index| seen[index]) {
             for parameter in 0..kernel.parameters() {
                 let (kernel, twin) = (kernel.parameter(index, parameter), model.parameter(index, parameter));
-                // A share of a step a step: the difference 1 - beta^t of the correction is taken in f32.
-                // And half a spacing of the parameter itself.
+                // Per step, a share of the step, because the correction 1 - beta^t is computed in f32. Plus
+                // half a spacing of the parameter itself.
                 let tolerance =
                     f64::from(n + 1) * (of_a_step * rates.of_parameter(parameter) + 6e-8 * twin.abs());
                 assert!(
@@ -136,13 +136,17 @@ fn compare_kind(
     assert!(unseen.iter().any(|&unseen| unseen), "{name}: some Gaussian must be out of sight");
     for index in (0..unseen.len()).filter(|&index| unseen[index]) {
         assert_same_bits(
-            &format!("{name}: mean of {index}, which nobody saw"),
+            &format!("{name}: mean of {index}, which no view saw"),
             &scene.model.means[index],
             &after.means[index],
         );
         let k = after.coeffs();
         let coefficients = |m: &Gaussians| m.sh_coeffs[index * k..(index + 1) * k].to_vec();
-        assert_same_bits("its coefficients", &coefficients(&scene.model), &coefficients(&after));
+        assert_same_bits(
+            "coefficients of the same Gaussian",
+            &coefficients(&scene.model),
+            &coefficients(&after),
+        );
     }
 }
 
@@ -153,16 +157,17 @@ fn scene(degree: u8) -> Scene {
 }
 
 #[test]
-fn six_steps_are_those_of_the_twin() {
+fn six_steps_match_the_twin() {
     for degree in [0, 1, 2, 3] {
         compare(&format!("degree {degree}"), &scene(degree), &step(), 6, |_, _, _, _| {});
     }
 }
 
 #[test]
-fn a_view_that_sees_little_takes_the_longer_steps_of_the_twin_in_all_but_scales_and_harmonics() {
+fn a_view_of_few_gaussians_takes_the_longer_steps_of_the_twin() {
     let mut scene = scene(1);
-    // Nine of ten Gaussians behind the camera: the factor is about sqrt(10).
+    // Nine of ten Gaussians are behind the camera, so the factor is about sqrt(10). Scales and higher
+    // harmonics keep their rates.
     scene.model.means.iter_mut().enumerate().filter(|(i, _)| i % 10 != 0).for_each(|(_, m)| m[2] = -60.0);
     let trainable = scene.model.len() as u32;
     let step = StepUniform { trainable, ..step() };
@@ -192,13 +197,13 @@ fn weights_on_opacity_and_scale_are_divided_by_the_visible() {
 }
 
 #[test]
-fn a_gaussian_whose_pixels_do_not_count_is_left_as_it_is() {
+fn a_gaussian_under_masked_pixels_alone_stays_unchanged() {
     let Some(gpu) = device() else { return };
     let scene = scene(1);
     let mut step = StepUniform { mean_noise: 0.02, ..step() };
     (step.opacity_reg, step.scale_reg) = (0.3, 0.7);
     let view = View::render(&gpu, &scene);
-    // As a mask gives it: the first columns count, the others do not.
+    // Gradients as under a mask: only the first columns count.
     let mut v = ImageGradients::random(4, view.pixels());
     for (i, pixel) in v.image.iter_mut().enumerate().filter(|(i, _)| i % 50 >= 8) {
         *pixel = [0.0; 4];
@@ -224,12 +229,12 @@ fn a_gaussian_whose_pixels_do_not_count_is_left_as_it_is() {
     };
     let (counted, seen) = (touches(true), touches(false));
     let away: Vec<usize> = (0..before.len()).filter(|&i| seen[i] && !counted[i]).collect();
-    assert!(away.len() > 5, "{} are in tiles that do not count", away.len());
-    assert!(away.iter().all(|&i| !moved(i)), "one without a gradient moved");
+    assert!(away.len() > 5, "{} Gaussians are only in masked tiles", away.len());
+    assert!(away.iter().all(|&i| !moved(i)), "a Gaussian without a gradient moved");
     assert!((0..before.len()).filter(|&i| moved(i)).count() > 20);
 }
 
-/// The numbers of a trained model, one Gaussian after the other.
+/// The means of a model after one step.
 fn means_after(scene: &Scene, blocks: Blocks, step: &StepUniform) -> Vec<[f32; 3]> {
     let gpu = device().unwrap();
     let view = View::render_blocks(&gpu, scene, blocks);
@@ -238,9 +243,9 @@ fn means_after(scene: &Scene, blocks: Blocks, step: &StepUniform) -> Vec<[f32; 3
 }
 
 #[test]
-fn noise_on_faint_gaussians_is_the_twins_and_does_not_depend_on_blocks() {
+fn noise_on_faint_gaussians_matches_the_twin_in_any_blocks() {
     let Some(gpu) = device() else { return };
-    // Opacities from 1/255 to 0.02, around the gate at 0.005; rates of 0, so that all that moves is noise.
+    // Opacities from 1/255 to 0.02, around the gate at 0.005. Rates of 0, so that only noise moves means.
     let mut scene = scene(0);
     let n = scene.model.len();
     scene
@@ -259,7 +264,7 @@ fn noise_on_faint_gaussians_is_the_twins_and_does_not_depend_on_blocks() {
     let mut moved = 0;
     let (v_model, _) = gradients(&gpu, &scene, &ImageGradients::random(3, 50 * 37));
     for (id, after) in whole.iter().enumerate() {
-        // One that is too faint for any pixel has no gradient and stays.
+        // A Gaussian that is too faint for any pixel has no gradient and stays.
         if (11..14).all(|parameter| v_model.parameter(id, parameter) == 0.0) {
             assert_eq!(*after, scene.model.means[id]);
             continue;
@@ -283,7 +288,7 @@ fn noise_on_faint_gaussians_is_the_twins_and_does_not_depend_on_blocks() {
         for k in 0..3 {
             let expected = model.means[id][k] + gate * 0.02 * shaped[k];
             let after = f64::from(after[k]);
-            // 1e-6: some ten operations on numbers of order 1, of which the noise itself is a hundredth.
+            // 1e-6: about ten operations on numbers near 1; the noise itself is about 0.01.
             assert!((after - expected).abs() < 1e-6, "mean[{k}] of {id}: kernel {after}, twin {expected}");
             moved += usize::from((after - model.means[id][k]).abs() > 1e-5);
         }

@@ -1,4 +1,4 @@
-//! Training over a background that is drawn anew for every iteration.
+//! Training over a background with a new random colour in every iteration.
 
 use std::sync::Arc;
 
@@ -55,7 +55,7 @@ fn alpha_where_black(gpu: &Arc<Gpu>, model: &Gaussians, photographs: &InMemory) 
 }
 
 #[test]
-fn what_is_black_becomes_opaque_over_random_colours_and_transparent_over_black() {
+fn black_walls_become_opaque_only_over_random_backgrounds() {
     let Some(gpu) = device() else { return };
     let photographs = photographs_of(&gpu, &wall(), 64, 48);
     let mut start = grey(&wall());
@@ -72,18 +72,21 @@ fn what_is_black_becomes_opaque_over_random_colours_and_transparent_over_black()
     };
     let (on, off) = (trained(random(240)), trained(config(240)));
     // Measured: 0.91 and 0.02.
-    assert!(on > 0.85 && off < 0.2, "mean alpha where photographs are black: {on} with, {off} without");
+    assert!(
+        on > 0.85 && off < 0.2,
+        "mean alpha where photographs are black: {on} over random colours, {off} over black"
+    );
 }
 
 #[test]
-fn a_seed_decides_every_byte_over_random_colours_and_a_resumed_run_draws_the_same() {
+fn a_seed_decides_random_backgrounds_also_after_a_resume() {
     let Some(gpu) = device() else { return };
     let photographs = photographs(&gpu, 48, 36);
     let (whole, progress) = train(&gpu, run(&photographs, random(30)), &[30]);
     let (again, _) = train(&gpu, run(&photographs, random(30)), &[1, 7, 3, 19]);
     assert_same_model("in small steps", &whole, &again);
     let (black, black_progress) = train(&gpu, run(&photographs, config(30)), &[30]);
-    assert_ne!(whole.means, black.means, "the background is black either way");
+    assert_ne!(whole.means, black.means, "random backgrounds must change the model");
     assert_ne!(progress.loss, black_progress.loss);
     let mut first = Trainer::new(Arc::clone(&gpu), run(&photographs, random(30))).unwrap();
     first.advance(13).unwrap();

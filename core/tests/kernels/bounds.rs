@@ -1,16 +1,16 @@
-//! How far rounding may take the rasteriser from its twin, by forward error analysis in f64.
+//! Bounds of the rounding error of the rasteriser against its twin, by forward error analysis in f64.
 //!
-//! The relative error of one alpha is that of its sigma and of `exp`. sigma is a sum that may cancel, so its
-//! error goes with the sum of its terms' sizes: large for needles. From there on errors add up as the
-//! formulas say, in first order. Where a decision (alpha against 1/255 or the cap, sigma against 0, the end
-//! of the ray) lies within the error of the number that it looks at, kernel and twin may decide differently:
-//! such pixels are edges and get the bound of the jump.
+//! The relative error of alpha comes from its sigma and from `exp`. The sum sigma may cancel, so its error
+//! depends on the sizes of its terms. It is large for needles. All later errors follow from the formulas in
+//! first order. A decision compares alpha with 1/255 or the cap, sigma with 0, or the transmittance with the
+//! end of the ray. Kernel and twin may decide differently when the compared number is within its error of the
+//! limit. Such pixels are edges and get the bound of the jump.
 
 use fathom_twins::{RasterGradients, RasterRules, Splat, TileLists};
 
 /// Spacing of f32 at 1: twice the rounding error of one operation.
 pub const EPSILON: f64 = f32::EPSILON as f64;
-/// Relative error of `exp` in units of EPSILON, besides that of its argument. WGSL allows 3 + 2 |x|.
+/// Relative error of `exp` in units of EPSILON, without the error of its argument. WGSL allows 3 + 2 |x|.
 const EXP: f64 = 8.0;
 /// Operations between the numbers of a splat and its sigma, times one half.
 const SIGMA: f64 = 4.0;
@@ -25,21 +25,21 @@ struct Step {
     alpha: f64,
     /// Relative error of alpha.
     alpha_error: f64,
-    /// What is left in front of it, with its relative error.
+    /// Transmittance in front of it, with its relative error.
     transmittance: f64,
     transmittance_error: f64,
     capped: bool,
 }
 
-/// The blending of one pixel with its decisions.
+/// The blending of one pixel and its decisions.
 struct Ray {
     steps: Vec<Step>,
-    /// Left behind the last, and its relative error.
+    /// Transmittance behind the last splat, and its relative error.
     transmittance: f64,
     transmittance_error: f64,
-    /// Sum over edges of how much weight may move; 0 without edges.
+    /// Weight that may change at edges, summed; 0 without edges.
     moved: f64,
-    /// Splats whose alpha is at the cap within its error.
+    /// Whether the alpha of some splat is within its error of the cap.
     cap_edges: bool,
 }
 
@@ -105,14 +105,14 @@ pub struct PixelBound {
 }
 
 impl Ray {
-    /// Sum of weights' errors, and the error of what is left.
+    /// Sum of the errors of the weights, and the error of the remaining transmittance.
     fn bound(&self) -> (f64, f64) {
         let weights: f64 = self
             .steps
             .iter()
             .map(|s| s.alpha * s.transmittance * (s.alpha_error + s.transmittance_error + 3.0 * EPSILON))
             .sum();
-        // T is found by subtracting weights: an absolute rounding error of EPSILON a splat at most.
+        // T is computed by subtracting weights: an absolute rounding error of at most EPSILON per splat.
         let left = self.transmittance * self.transmittance_error + EPSILON * (self.steps.len() as f64 + 1.0);
         let sums = EPSILON * (self.steps.len() as f64 + 2.0);
         (weights + sums + self.moved, left + self.moved)
@@ -163,7 +163,7 @@ pub struct SplatBound {
     pub range: f64,
     pub abs: f64,
     pub contribution: f64,
-    /// Pixels at an edge that it takes part in.
+    /// Number of edge pixels that it contributes to.
     pub edges: u32,
 }
 
@@ -183,10 +183,10 @@ pub fn of_splat_gradients(
             let pixel = (y * width + x) as usize;
             let ray = follow(splats, lists.of_tile(x / 16, y / 16), x, y);
             let (v_rgb, v_alpha, v_range) = (v.rgb[pixel], v.alpha[pixel].abs(), v.range[pixel].abs());
-            // Greatest value that anything blended here can have.
+            // Upper bound of everything that is blended here.
             let scale = colour * v_rgb.iter().map(|v| v.abs()).sum::<f64>() + far * v_range + v_alpha;
             let (weights, left) = ray.bound();
-            // `rem` begins as the whole pixel and loses what goes by.
+            // `rem` starts as the whole pixel and loses each blended part.
             let mut rem_error = scale * (weights + left + 4.0 * EPSILON);
             for step in &ray.steps {
                 let Some(splat) = &splats[step.id] else { continue };
@@ -196,7 +196,7 @@ pub fn of_splat_gradients(
                 let weight_error = step.alpha_error + step.transmittance_error + (3.0 + SUM) * EPSILON;
                 let mut moved = 0.0;
                 if ray.moved > 0.0 || (ray.cap_edges && !near_zero(step.alpha)) {
-                    // |v_alpha| is at most 2 scale T; T itself moves by a share of what moved.
+                    // |v_alpha| is at most 2 scale T; T itself changes by a share of the moved weight.
                     bound.edges += 1;
                     moved = 4.0 * scale * (t + ray.moved).min(1.0);
                 }

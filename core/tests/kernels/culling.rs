@@ -1,4 +1,4 @@
-//! Culling by chunks: it must leave out much of what a view does not see, and nothing of what it sees.
+//! Culling by chunks: it must skip most chunks that a view does not see, and none that it sees.
 
 use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::{Blocks, CULL_CHUNK, FrameUniform, Gpu, spatial_order};
@@ -11,7 +11,7 @@ use crate::view::{Scene, View};
 
 const COUNT: usize = 8 * CULL_CHUNK as usize;
 
-/// Cameras outside and inside of a box of side 2, wide and narrow, one with its back to it.
+/// Cameras outside and inside a box of side 2, with wide and narrow angles; one looks away from it.
 fn cameras() -> Vec<(&'static str, PinholeCamera, Pose)> {
     let (wide, pose) = off_centre_view(75, 53, 3.0);
     let narrow = PinholeCamera { fx: 12.0 * wide.fx, fy: 12.0 * wide.fy, ..wide };
@@ -21,11 +21,11 @@ fn cameras() -> Vec<(&'static str, PinholeCamera, Pose)> {
         ("a narrow angle", narrow, looking(DVec3::new(0.5, 0.6, -3.0), DVec3::new(0.5, 0.5, 0.0))),
         ("from inside", wide, looking(DVec3::new(0.1, 0.2, 0.3), DVec3::new(1.0, 0.1, 0.4))),
         ("narrow from inside", narrow, looking(DVec3::new(-0.3, 0.1, 0.0), DVec3::new(-0.9, 0.5, 0.2))),
-        ("its back to it", wide, looking(DVec3::new(0.0, 0.1, -4.0), DVec3::new(0.0, 0.2, -9.0))),
+        ("looking away", wide, looking(DVec3::new(0.0, 0.1, -4.0), DVec3::new(0.0, 0.2, -9.0))),
     ]
 }
 
-/// Who is visible, and how many chunks were looked at.
+/// Visible Gaussians, and the number of chunks that the culling kept.
 fn visible(gpu: &Gpu, view: &View) -> (Vec<usize>, u32) {
     let chunks = |block: &fathom_core::gpu::Block| -> u32 {
         gpu.read::<u32>(&block.chunk_seen, 0, block.chunks() as usize).unwrap().iter().sum()
@@ -34,7 +34,7 @@ fn visible(gpu: &Gpu, view: &View) -> (Vec<usize>, u32) {
 }
 
 #[test]
-fn bounds_leave_out_much_and_nothing_that_is_visible() {
+fn bounds_skip_many_chunks_and_nothing_visible() {
     type Make = fn(u32, usize, u8) -> Gaussians;
     let models: [(&str, Make); 4] = [
         ("random", samples::random),
@@ -45,9 +45,9 @@ fn bounds_leave_out_much_and_nothing_that_is_visible() {
     for gpu in layouts() {
         for (kind, make) in models {
             let mut model = make(31, COUNT, 0);
-            // Most are small, so that not every chunk reaches everywhere.
+            // Most Gaussians are small, so that chunks have limited bounds.
             model.log_scales.iter_mut().for_each(|scales| *scales = scales.map(|s| s - 2.5));
-            // Both hold them in one order: Gaussians of the same depth are blended in it.
+            // Both blocks use the same order, because it decides the blending of Gaussians of equal depth.
             let mut ordered = Gaussians::empty(0);
             spatial_order(&model).iter().for_each(|&index| ordered.push_from(&model, index as usize));
             let model = ordered;
@@ -61,7 +61,7 @@ fn bounds_leave_out_much_and_nothing_that_is_visible() {
             let mut all = View::prepare_lists(&gpu, &Scene::new(kind, model, 75, 53), blocks, 1 << 20);
             for (name, camera, pose) in cameras() {
                 let uniform = FrameUniform::of_camera(&camera, &pose, gpu.tile());
-                // A band of the picture has a rectangle of its own.
+                // A band of the picture has its own rectangle.
                 for uniform in [uniform, uniform.bands(3, gpu.tile())[1]] {
                     (bounded.uniform, all.uniform) = (uniform, uniform);
                     bounded.forward();
@@ -73,7 +73,7 @@ fn bounds_leave_out_much_and_nothing_that_is_visible() {
                     if kind == "random" && name == "a narrow angle" {
                         assert!((1..=5).contains(&chunks), "{name}: {chunks} of 8 chunks");
                     }
-                    if name == "its back to it" && kind == "random" {
+                    if name == "looking away" && kind == "random" {
                         assert_eq!((chunks, seen.len()), (0, 0));
                     }
                 }

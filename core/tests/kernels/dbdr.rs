@@ -1,4 +1,5 @@
-//! DBDR (eq. 9): a water whose coefficients follow from range, against the twin, and what it does in a run.
+//! DBDR (eq. 9), a water whose coefficients depend on range: kernels against the twin, and its effect on a
+//! run.
 
 use std::sync::Arc;
 
@@ -22,7 +23,7 @@ const WATER: Water =
 const UNIT: f64 = 3.2;
 const RATE: f32 = 0.05;
 
-/// The water acts on pixels, and there are maps where `mode` says so.
+/// A water on pixels with this mode of DBDR.
 fn by_pixel(mode: DbdrMode) -> WaterConfig {
     let dbdr = DbdrConfig { mode, lr: RATE, ..DbdrConfig::default() };
     WaterConfig { medium: Medium::PerPixel, blend: Blend::Linear, dbdr, ..WaterConfig::default() }
@@ -38,8 +39,8 @@ fn some_refinement(seed: u32) -> RangeModulation {
         .with_array([u(0), u(1), u(2), u(3)].map(|value| f64::from(value as f32)))
 }
 
-/// What one iteration of a picture leaves, before and after the step of the water.
-struct Left {
+/// The outputs of one iteration of a picture, before and after the step of the water.
+struct Outputs {
     seen: Vec<[f32; 4]>,
     v_image: Vec<[f32; 4]>,
     v_range: Vec<f32>,
@@ -50,7 +51,13 @@ struct Left {
     left_out: u32,
 }
 
-fn iteration(gpu: &Arc<Gpu>, start: MediumRun, [width, height]: [u32; 2], v: &[[f32; 4]], seed: u32) -> Left {
+fn iteration(
+    gpu: &Arc<Gpu>,
+    start: MediumRun,
+    [width, height]: [u32; 2],
+    v: &[[f32; 4]],
+    seed: u32,
+) -> Outputs {
     let (image, range) = picture(width * height, seed);
     let mut water = DeviceMedium::new(gpu, start).unwrap();
     let mut frame = Frame::new(gpu, 1, 1, 1).unwrap();
@@ -89,7 +96,7 @@ fn iteration(gpu: &Arc<Gpu>, start: MediumRun, [width, height]: [u32; 2], v: &[[
     let rows: Vec<[[f32; 4]; 3]> = gpu.read(partials, 0, groups).unwrap();
     let refined: Vec<[f32; 4]> =
         gpu.read(refinement_partials, 0, groups.min(refinement_partials.size() as usize / 16)).unwrap();
-    Left {
+    Outputs {
         seen: gpu.read(seen, 0, pixels).unwrap(),
         v_image: gpu.read(&v_image, 0, pixels).unwrap(),
         v_range: gpu.read(&v_range, 0, pixels).unwrap(),
@@ -101,7 +108,7 @@ fn iteration(gpu: &Arc<Gpu>, start: MediumRun, [width, height]: [u32; 2], v: &[[
     }
 }
 
-/// What was blended and its range: empty, thin, half and whole pixels.
+/// Blended colours and their range: empty, thin, partial and opaque pixels.
 fn picture(pixels: u32, seed: u32) -> (Vec<[f32; 4]>, Vec<f32>) {
     let u = |i, j| uniform_at(seed, Stream::Test, i, j);
     let alpha = |i: u32| [0.0, 1e-4, u(i, 3), 1.0][(i % 4) as usize];
@@ -115,13 +122,13 @@ fn gradients(pixels: u32, seed: u32) -> Vec<[f32; 4]> {
 }
 
 #[test]
-fn pictures_under_a_water_that_follows_from_range_and_their_gradients_are_those_of_the_twin() {
+fn pictures_and_gradients_with_dbdr_match_the_twin() {
     for gpu in layouts() {
         for (k, size) in [[1, 1], [33, 31], [32, 32], [75, 53]].into_iter().enumerate() {
             let (seed, pixels) = (400 + k as u32, size[0] * size[1]);
             let refinement = some_refinement(seed);
             let v = gradients(pixels, seed);
-            let left = iteration(&gpu, medium_run(Some(refinement)), size, &v, seed);
+            let outputs = iteration(&gpu, medium_run(Some(refinement)), size, &v, seed);
             let (image, range) = picture(pixels, seed);
             let (mut v_water, mut v_refinement) = ([0.0; 9], [0.0; 4]);
             for i in 0..pixels as usize {
@@ -139,41 +146,41 @@ fn pictures_under_a_water_that_follows_from_range_and_their_gradients_are_those_
                     &mut v_refinement,
                 );
                 for c in 0..3 {
-                    // 2e-6 and 1e-5 as for the nine numbers alone.
-                    let (kernel, twin) = (f64::from(left.seen[i][c]), seen[c].0);
+                    // 2e-6 and 1e-5, as for a water without DBDR.
+                    let (kernel, twin) = (f64::from(outputs.seen[i][c]), seen[c].0);
                     assert!((kernel - twin).abs() < 2e-6, "{size:?}: pixel {i}, {c}: {kernel} and {twin}");
-                    let (kernel, twin) = (f64::from(left.v_image[i][c]), by.rgb[c]);
+                    let (kernel, twin) = (f64::from(outputs.v_image[i][c]), by.rgb[c]);
                     let close = (kernel - twin).abs() < 1e-5 * (1.0 + twin.abs());
                     assert!(close, "{size:?}: gradient of pixel {i}, {c}: {kernel} and {twin}");
                 }
                 let scale = 1.0 + by.alpha.abs() + by.range.abs();
-                // Every photograph is masked, so alpha has no gradient of its own.
-                let (kernel, twin) = (f64::from(left.v_image[i][3]), by.alpha);
+                // Every photograph is masked, so no loss term on alpha adds a gradient.
+                let (kernel, twin) = (f64::from(outputs.v_image[i][3]), by.alpha);
                 assert!((kernel - twin).abs() < 2e-5 * scale, "{size:?}: alpha of {i}: {kernel} and {twin}");
-                let (kernel, twin) = (f64::from(left.v_range[i]), by.range);
+                let (kernel, twin) = (f64::from(outputs.v_range[i]), by.range);
                 assert!((kernel - twin).abs() < 2e-5 * scale, "{size:?}: range of {i}: {kernel} and {twin}");
             }
-            let sums = left.v_water.into_iter().chain(left.v_refinement);
+            let sums = outputs.v_water.into_iter().chain(outputs.v_refinement);
             for (k, (kernel, twin)) in sums.zip(v_water.into_iter().chain(v_refinement)).enumerate() {
-                // Sums of `pixels` numbers of up to about 5, most of which cancel.
+                // Sums of `pixels` numbers up to about 5, which mostly cancel.
                 assert!(
                     (kernel - twin).abs() < 2e-5 * f64::from(pixels).max(1.0),
                     "{size:?}: {k}: {kernel} and {twin}"
                 );
             }
-            // And the steps that follow from them.
-            let mut nine = WaterState::new(&WATER, UNIT);
-            nine.step(&left.v_water, UNIT, RATE.into(), 0.0);
-            for (found, expected) in left.water.to_array().iter().zip(nine.water(UNIT).to_array()) {
+            // The steps from these gradients.
+            let mut twin_water = WaterState::new(&WATER, UNIT);
+            twin_water.step(&outputs.v_water, UNIT, RATE.into(), 0.0);
+            for (found, expected) in outputs.water.to_array().iter().zip(twin_water.water(UNIT).to_array()) {
                 assert!((found / expected - 1.0).abs() < 1e-5, "{found} and {expected} after a step");
             }
-            let mut four = RefinementState::new(refinement);
-            four.step(&left.v_refinement, RATE.into());
-            let found = left.refinement.unwrap();
-            for (found, expected) in found.to_array().iter().zip(four.refinement.to_array()) {
+            let mut twin_refinement = RefinementState::new(refinement);
+            twin_refinement.step(&outputs.v_refinement, RATE.into());
+            let found = outputs.refinement.unwrap();
+            for (found, expected) in found.to_array().iter().zip(twin_refinement.refinement.to_array()) {
                 assert!((found - expected).abs() < 1e-6, "{found} and {expected} after a step");
             }
-            assert_eq!((found.scale, found.unit, left.left_out), (2.0, UNIT, 0));
+            assert_eq!((found.scale, found.unit, outputs.left_out), (2.0, UNIT, 0));
         }
     }
 }
@@ -189,35 +196,42 @@ fn the_identity_is_the_water_without_a_refinement_to_the_bit() {
         assert_same_bits("pictures", &plain.seen, &refined.seen);
         assert_same_bits("gradients by colour and alpha", &plain.v_image, &refined.v_image);
         assert_same_bits("gradients by range", &plain.v_range, &refined.v_range);
-        assert_same_bits("gradients by the nine", &plain.v_water, &refined.v_water);
-        assert_same_bits("the nine after a step", &plain.water.to_array(), &refined.water.to_array());
+        assert_same_bits("gradients by the water parameters", &plain.v_water, &refined.v_water);
+        assert_same_bits(
+            "the water parameters after a step",
+            &plain.water.to_array(),
+            &refined.water.to_array(),
+        );
         assert_eq!(plain.refinement, None);
-        assert!(refined.refinement.unwrap().to_array().iter().all(|value| *value != 0.0), "it moves");
+        assert!(
+            refined.refinement.unwrap().to_array().iter().all(|value| *value != 0.0),
+            "the refinement must move"
+        );
     }
 }
 
 #[test]
-fn saturated_factors_stay_finite_and_a_gradient_that_is_not_moves_nothing() {
+fn saturated_factors_stay_finite_and_nan_gradients_move_nothing() {
     for gpu in layouts() {
         let (size, seed) = ([33, 31], 420);
         let v = gradients(size[0] * size[1], seed);
         let steep = RangeModulation::identity(2.0, UNIT).with_array([1e20, 5.0, -1e20, -80.0]);
-        let left = iteration(&gpu, medium_run(Some(steep)), size, &v, seed);
-        assert!(left.seen.iter().flatten().all(|value| value.is_finite()));
-        assert!(left.v_image.iter().flatten().chain(&left.v_range).all(|value| value.is_finite()));
-        assert!(left.refinement.unwrap().is_sound() && left.water.is_physical());
+        let outputs = iteration(&gpu, medium_run(Some(steep)), size, &v, seed);
+        assert!(outputs.seen.iter().flatten().all(|value| value.is_finite()));
+        assert!(outputs.v_image.iter().flatten().chain(&outputs.v_range).all(|value| value.is_finite()));
+        assert!(outputs.refinement.unwrap().is_sound() && outputs.water.is_physical());
 
         let start = some_refinement(seed);
         let nan = vec![[f32::NAN, 0.1, 0.1, 0.0]; v.len()];
-        let left = iteration(&gpu, medium_run(Some(start)), size, &nan, seed);
-        assert_eq!((left.refinement, left.left_out), (Some(start), 1));
-        let unmoved = left.water.to_array().into_iter().zip(WATER.to_array());
+        let outputs = iteration(&gpu, medium_run(Some(start)), size, &nan, seed);
+        assert_eq!((outputs.refinement, outputs.left_out), (Some(start), 1));
+        let unmoved = outputs.water.to_array().into_iter().zip(WATER.to_array());
         assert!(unmoved.into_iter().all(|(found, before)| (found - before).abs() < 1e-7));
     }
 }
 
 #[test]
-fn a_renderer_of_the_record_shows_what_the_trainer_compares() {
+fn a_renderer_from_the_record_matches_the_trainer() {
     let ways = [
         (medium::DECODED, Composition::PixelsLinear),
         (medium::AS_SHOWN, Composition::PixelsSrgb),
@@ -256,7 +270,7 @@ fn a_renderer_of_the_record_shows_what_the_trainer_compares() {
         let picture = rendered(Output::Underwater);
         for (i, (trained, shown)) in seen.iter().zip(&picture.rgb).enumerate() {
             for c in 0..3 {
-                // A fortieth of a step of 8 bits: f32 against f64, and another order of equal depths.
+                // 1e-4 is a fortieth of an 8-bit step: f32 against f64, and another order of equal depths.
                 let difference = (trained[c] - shown[c]).abs();
                 assert!(
                     difference < 1e-4,
@@ -266,10 +280,10 @@ fn a_renderer_of_the_record_shows_what_the_trainer_compares() {
                 );
             }
         }
-        // The water's own light, by the twin.
-        let veil = rendered(Output::Backscatter);
-        for (i, shown) in veil.rgb.iter().enumerate() {
-            let [alpha, range] = [veil.alpha[i], veil.range[i]].map(f64::from);
+        // The backscatter of the twin.
+        let backscatter = rendered(Output::Backscatter);
+        for (i, shown) in backscatter.rgb.iter().enumerate() {
+            let [alpha, range] = [backscatter.alpha[i], backscatter.range[i]].map(f64::from);
             let twin = form_refined(
                 &record.water(),
                 &some_refinement(431),
@@ -289,7 +303,7 @@ fn a_renderer_of_the_record_shows_what_the_trainer_compares() {
 }
 
 #[test]
-fn a_run_with_maps_depends_on_neither_interruptions_nor_lists_nor_bands() {
+fn interruptions_short_lists_and_bands_change_no_byte() {
     let Some(gpu) = device() else { return };
     let photographs = photographs(&gpu, 64, 48);
     let new = || watery(&photographs, config(30), by_pixel(DbdrMode::Maps));
@@ -300,7 +314,7 @@ fn a_run_with_maps_depends_on_neither_interruptions_nor_lists_nor_bands() {
 }
 
 #[test]
-fn maps_that_do_not_learn_change_no_byte_and_without_dbdr_the_prior_stays() {
+fn maps_at_rate_0_change_no_byte_and_no_dbdr_keeps_the_prior() {
     let Some(gpu) = device() else { return };
     let photographs = photographs(&gpu, 48, 36);
     let trained = |water: WaterConfig| {
@@ -315,9 +329,9 @@ fn maps_that_do_not_learn_change_no_byte_and_without_dbdr_the_prior_stays() {
     let (maps, _, with_maps) = trained(still);
     assert_same_model("maps at a rate of 0", &constants, &maps);
     assert_eq!(moved, with_maps);
-    assert_ne!(before, moved, "constants descend");
+    assert_ne!(before, moved, "constants must move");
     let (_, before, after) = trained(by_pixel(DbdrMode::None));
-    assert_eq!(before, after, "without DBDR the nine stay");
+    assert_eq!(before, after, "without DBDR the water parameters must stay");
 }
 
 #[test]
@@ -337,7 +351,7 @@ fn maps_fit_a_water_that_constants_cannot() {
         let mut run = watery(&wet, config(300), WaterConfig { freeze_at: 1.0, ..by_pixel(mode) });
         run.medium.as_mut().unwrap().water = WATER;
         let mut trainer = Trainer::new(Arc::clone(&gpu), run).unwrap();
-        // An epoch of 18 views at the end.
+        // The loss of the last epoch of 18 views.
         trainer.advance(282).unwrap();
         (trainer.advance(18).unwrap().loss, trainer.water_view().unwrap().unwrap())
     };

@@ -1,4 +1,4 @@
-//! Density control's kernels: statistics, splitting, placing.
+//! The kernels of density control: statistics, splitting, placing.
 
 use fathom_core::config::Moments;
 use fathom_core::gaussians::Gaussians;
@@ -16,7 +16,7 @@ fn block_of(gpu: &Gpu, model: &Gaussians, capacity: u32) -> Blocks {
 }
 
 #[test]
-fn statistics_are_opacity_mean_gradients_and_size_and_start_anew() {
+fn statistics_are_opacity_gradients_and_size_and_reset_sums() {
     let Some(gpu) = device() else { return };
     let mut model = samples::random(141, 200, 1);
     model.means[3][1] = f32::NAN;
@@ -49,21 +49,21 @@ fn statistics_are_opacity_mean_gradients_and_size_and_start_anew() {
         for (found, expected) in found[1..].iter().zip(numbers) {
             assert!(
                 (f64::from(*found) - expected).abs() <= 1e-6 * expected,
-                "of {i}: {found} and {expected}"
+                "statistics of {i}: {found} and {expected}"
             );
         }
     }
     let after: Vec<f32> = gpu.read(&training.density_sums, 0, 800).unwrap();
-    assert!(after.chunks(4).all(|row| row == [0.0, 0.0, 0.3, 0.0]), "only the smoothing stays");
+    assert!(after.chunks(4).all(|row| row == [0.0, 0.0, 0.3, 0.0]), "only the smoothing must stay");
 }
 
 #[test]
-fn a_split_keeps_the_place_and_the_variance_and_its_halves_start_anew() {
+fn a_split_keeps_place_and_variance_and_resets_its_halves() {
     let Some(gpu) = device() else { return };
     for degree in [0, 1, 3] {
         let model = samples::random(142, 100, degree);
         let mut blocks = block_of(&gpu, &model, 130);
-        // Sources 1, 4, 7, ...; the first five to the places of others, the rest behind the end.
+        // Sources 1, 4, 7, ...; the first five halves replace other Gaussians, the rest are appended.
         let sources: Vec<u32> = (0..33).map(|i| 3 * i + 1).collect();
         let places: Vec<u32> = (0..33).map(|i| if i < 5 { 3 * i } else { 95 + i }).collect();
         let staged_at: Vec<u32> = (0..33).map(|i| 32 - i).collect();
@@ -74,7 +74,7 @@ fn a_split_keeps_the_place_and_the_variance_and_its_halves_start_anew() {
         poison(&gpu, &staged);
         let (splits, placements) = (storage(&gpu, &rows(&sources)), storage(&gpu, &rows(&places)));
         let count = gpu.uniform("count", &[33_u32, 0, 0, 0]);
-        // Steps that the sources had: their halves have none.
+        // The sources have steps; their halves must have none.
         let (_, block, _) = blocks.trainable().next().unwrap();
         for &source in &sources {
             gpu.write(&block.transforms, u64::from(source) * 48 + 44, &[7_u32]);
@@ -116,7 +116,7 @@ fn a_split_keeps_the_place_and_the_variance_and_its_halves_start_anew() {
             untouched.push_from(&after, index as usize);
             let mut expected = Gaussians::empty(degree);
             expected.push_from(&model, index as usize);
-            assert_eq!(untouched, expected, "Gaussian {index} has no part in this");
+            assert_eq!(untouched, expected, "Gaussian {index} must not change");
         }
     }
 }
@@ -124,7 +124,7 @@ fn a_split_keeps_the_place_and_the_variance_and_its_halves_start_anew() {
 fn check_split(before: &Gaussians64, after: &Gaussians64, source: usize, place: usize) {
     let opacity = |logit: f64| 1.0 / (1.0 + (-logit).exp());
     let close = |what: &str, a: f64, b: f64| {
-        // 1e-5: powers and logarithms of numbers of order 1.
+        // 1e-5: powers and logarithms of numbers near 1.
         assert!(
             (a - b).abs() < 1e-5 * (1.0 + b.abs()),
             "{what} of the halves of {source}: {a}, expected {b}"
@@ -152,11 +152,11 @@ fn check_split(before: &Gaussians64, after: &Gaussians64, source: usize, place: 
     let one = 1.0 - opacity(before.opacity_logits[source]);
     for child in [source, place] {
         close("opacity", opacity(after.opacity_logits[child]), 1.0 - one.powf(0.5_f64.sqrt()));
-        assert_eq!(after.quats[child], before.quats[source], "turn of the halves of {source}");
+        assert_eq!(after.quats[child], before.quats[source], "rotation of the halves of {source}");
     }
 }
 
-/// Two standard normal numbers from 64 bits, as `shared/random.wgsl` makes them.
+/// Two standard normal numbers from 64 bits, as in `shared/random.wgsl`.
 fn normal_pair(a: u32, b: u32) -> [f64; 2] {
     let open = |bits: u32| (f64::from(bits >> 8) + 1.0) / 16_777_216.0;
     let (radius, turn) = ((-2.0 * open(a).ln()).sqrt(), std::f64::consts::TAU * open(b));
@@ -164,14 +164,14 @@ fn normal_pair(a: u32, b: u32) -> [f64; 2] {
 }
 
 #[test]
-fn a_clone_is_a_copy_and_the_halves_of_a_classic_split_are_drawn_from_their_parent() {
+fn clones_are_copies_and_classic_halves_are_drawn_from_parents() {
     let Some(gpu) = device() else { return };
     let (seed, iteration) = (77, 1234);
     for degree in [0, 3] {
         let model = samples::random(143, 100, degree);
         let mut blocks = block_of(&gpu, &model, 140);
         blocks.set_trainable_total(&gpu, 140);
-        // Parents 0, 2, 4, ...; every other one is split; children behind the end, staged in another order.
+        // Parents 0, 2, 4, ...; every other one is split. Children are appended and staged in another order.
         let parents: Vec<u32> = (0..40).map(|i| 2 * i).collect();
         let rows: Vec<[u32; 4]> =
             parents.iter().map(|&at| [at, 39 - at / 2, u32::from(at % 4 == 0), 0]).collect();
@@ -220,7 +220,7 @@ fn a_clone_is_a_copy_and_the_halves_of_a_classic_split_are_drawn_from_their_pare
                     before.sh_coeffs[parent * k..(parent + 1) * k]
                 );
                 if !split {
-                    assert_eq!(after.means[at], before.means[parent], "a clone keeps its place");
+                    assert_eq!(after.means[at], before.means[parent], "a clone must keep its place");
                     assert_eq!(after.log_scales[at], before.log_scales[parent]);
                     continue;
                 }
@@ -228,7 +228,7 @@ fn a_clone_is_a_copy_and_the_halves_of_a_classic_split_are_drawn_from_their_pare
                 let mean =
                     glam::DVec3::from(before.means[parent]) + turn * (scales * glam::DVec3::from(normal));
                 let difference = (mean - glam::DVec3::from(after.means[at])).length();
-                // 1e-5 of the deviation: logarithm, root and cosine of f32, whose sine near 6 is good to
+                // 1e-5 of the deviation: logarithm, root and cosine in f32; the sine near 6 is accurate to
                 // 1e-6.
                 let tolerance = 1e-5 * scales.max_element() + 1e-6;
                 assert!(difference < tolerance, "centre of {at}, a half of {parent}: {difference:e} off");
@@ -238,7 +238,7 @@ fn a_clone_is_a_copy_and_the_halves_of_a_classic_split_are_drawn_from_their_pare
             }
         }
         for index in (0..100).filter(|i| i % 2 == 1 || *i >= 80) {
-            assert_eq!(after.means[index], before.means[index], "Gaussian {index} has no part in this");
+            assert_eq!(after.means[index], before.means[index], "Gaussian {index} must not change");
         }
     }
 }
@@ -298,7 +298,7 @@ fn a_reset_lowers_opacities_and_forgets_their_moments_alone() {
             assert!((found - was.min(most)).abs() < 1e-6, "{found} of {was}");
             lowered += usize::from(*was > most);
         }
-        assert!(lowered > 45, "{lowered} were above");
+        assert!(lowered > 45, "{lowered} were lowered");
         assert_same_bits("centres", &after.means, &model.means);
         let expected: Vec<u32> = (0..100 * row)
             .map(|i| if i / row < 90 && words.contains(&(i % row)) { 0 } else { i + 1 })
@@ -312,13 +312,13 @@ fn a_reset_lowers_opacities_and_forgets_their_moments_alone() {
 }
 
 #[test]
-fn a_gaussian_is_smoothed_by_the_finest_sampling_of_the_views_that_see_it() {
+fn the_finest_view_that_sees_a_gaussian_sets_its_smoothing() {
     let Some(gpu) = device() else { return };
     let model = samples::random(145, 300, 0);
     let blocks = block_of(&gpu, &model, 300);
     let (_, block, training) = blocks.trainable().next().unwrap();
     gpu.write(&training.density_sums, 0, &[[1.0_f32, 2.0, 3.0, 4.0]; 300]);
-    // Long and short lenses, one of them among the Gaussians.
+    // Long and short lenses; one camera is among the Gaussians.
     let mut views: Vec<_> = [3.0, 2.0, 0.2].map(|away| samples::off_centre_view(75, 53, away)).to_vec();
     views[1].0.fx *= 3.0;
     let mut rows: Vec<[f32; 4]> = Vec::new();
@@ -352,9 +352,9 @@ fn a_gaussian_is_smoothed_by_the_finest_sampling_of_the_views_that_see_it() {
         let rates: Vec<f64> = rates.collect();
         by_views[rates.len()] += 1;
         let expected = rates.iter().copied().reduce(f64::max).map_or(0.0, |rate| 0.2_f64.sqrt() / rate);
-        // 1e-5: a depth that is a sum of numbers of order 3; it is a tenth where it matters most.
+        // 1e-5: the depth is a sum of numbers near 3, and about 0.1 where the error matters most.
         let difference = (f64::from(row[2]) - expected).abs();
-        assert!(difference <= 1e-5 * expected.max(0.01), "of {index}: {} and {expected}", row[2]);
+        assert!(difference <= 1e-5 * expected.max(0.01), "smoothing of {index}: {} and {expected}", row[2]);
     }
-    assert!(by_views[1..].iter().all(|&count| count > 0), "seen by so many views: {by_views:?}");
+    assert!(by_views[1..].iter().all(|&count| count > 0), "Gaussians by number of views: {by_views:?}");
 }

@@ -1,4 +1,4 @@
-//! The one device of this process, and small helpers for buffers.
+//! The only device of this process, and small helpers for buffers.
 
 use std::io::Write;
 use std::sync::{Arc, OnceLock};
@@ -21,8 +21,8 @@ pub fn device() -> Option<Arc<Gpu>> {
         .clone()
 }
 
-/// A device for each layout of tiles that this adapter can run: that of GPUs, and those of CPU adapters. The
-/// last has shaders without checks, as a release build has.
+/// One device for each tile layout that this adapter can run: the layout of GPUs, and those of CPU adapters.
+/// The last device has shaders without checks, as in a release build.
 ///
 /// Empty where [`device`] is `None`.
 pub fn layouts() -> Vec<Arc<Gpu>> {
@@ -58,13 +58,13 @@ pub fn storage<T: bytemuck::Pod>(gpu: &Gpu, values: &[T]) -> wgpu::Buffer {
     buffer
 }
 
-/// Fills a buffer with numbers that spoil every result that they reach.
+/// Fills a buffer with values that spoil every result that uses them.
 pub fn poison(gpu: &Gpu, buffer: &wgpu::Buffer) {
     let words: Vec<u32> = (0..buffer.size() / 4).map(|i| RUBBISH[(i % 2) as usize]).collect();
     gpu.write(buffer, 0, &words);
 }
 
-/// Asserts that two lists are bit for bit the same; says where they are not.
+/// Asserts that two lists are bitwise equal; reports where they differ.
 #[track_caller]
 pub fn assert_same_bits<T: bytemuck::Pod>(what: &str, left: &[T], right: &[T]) {
     assert_eq!(left.len(), right.len(), "{what}: lengths");

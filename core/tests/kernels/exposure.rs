@@ -1,4 +1,4 @@
-//! Exposures of the training views: kernels against the twin, and what they do in a run.
+//! Exposures of the training views: kernels against the twin, and their effect on a run.
 
 use std::sync::Arc;
 
@@ -39,14 +39,15 @@ fn assert_near(what: &str, kernel: &[[f32; 4]], twin: &[[f64; 3]], tolerance: f6
 }
 
 #[test]
-fn exposed_colours_gradients_and_steps_of_any_size_are_those_of_the_twin() {
+fn colours_gradients_and_steps_of_any_size_match_the_twin() {
     const VIEWS: u32 = 5;
     for gpu in layouts() {
         let mut exposures = Exposures::new(&gpu, VIEWS).unwrap();
         let mut twin = ExposureState::new(VIEWS as usize);
         let mut seen = [0; VIEWS as usize];
         let counters = storage(&gpu, &[0_u32; counter::COUNT as usize]);
-        // One pixel, around a workgroup's 1024, many workgroups, and small after large.
+        // One pixel, sizes around the 1024 of a workgroup, many workgroups, and a small size after a large
+        // one.
         let sizes = [(1, 1), (17, 1), (33, 31), (32, 32), (1025, 1), (75, 53), (300, 300), (9, 100)];
         for (k, (width, height)) in sizes.into_iter().enumerate() {
             let (pixels, view) = (width * height, (3 * k as u32) % VIEWS);
@@ -68,20 +69,23 @@ fn exposed_colours_gradients_and_steps_of_any_size_are_those_of_the_twin() {
             let v_rendered: Vec<[f32; 4]> = gpu.read(&v_image, 0, pixels as usize).unwrap();
 
             let exposure = twin.exposures[view as usize];
-            // 1e-5: three products of numbers near 1, of an exposure that is right to 1e-6 (below).
+            // 1e-5: three products of numbers near 1, with an exposure that is accurate to 1e-6 (see below).
             assert_near(&what, &exposed, &fathom_twins::expose(&wide(&render), &exposure), 1e-5);
             let (v_rgb, v_exposure) =
                 fathom_twins::expose_backward(&wide(&render), &wide(&v_exposed), &exposure);
             assert_near(&format!("{what}, gradient"), &v_rendered, &v_rgb, 1e-5);
-            assert!(exposed.iter().zip(&render).all(|(a, b)| a[3] == b[3]), "{what}: alpha stays");
-            assert!(v_rendered.iter().zip(&v_exposed).all(|(a, b)| a[3] == b[3]), "{what}: v of alpha stays");
+            assert!(exposed.iter().zip(&render).all(|(a, b)| a[3] == b[3]), "{what}: alpha must not change");
+            assert!(
+                v_rendered.iter().zip(&v_exposed).all(|(a, b)| a[3] == b[3]),
+                "{what}: the gradient of alpha must not change"
+            );
 
             twin.step(view as usize, &v_exposure, 0.05);
             let after = exposures.download(&gpu).unwrap();
             for (v, (kernel, twin)) in after.iter().zip(&twin.exposures).enumerate() {
                 for (kernel, twin) in kernel.iter().flatten().zip(twin.iter().flatten()) {
-                    // Sums of up to 1e5 numbers of one order are right to 1e-6 of their size; a step is at
-                    // most 0.2.
+                    // Sums of up to 1e5 numbers of similar size are accurate to 1e-6 of that size; a step is
+                    // at most 0.2.
                     assert!(
                         (f64::from(*kernel) - twin).abs() < 2e-6,
                         "{what}: exposure of view {v}: {kernel}, twin {twin}"
@@ -93,7 +97,7 @@ fn exposed_colours_gradients_and_steps_of_any_size_are_those_of_the_twin() {
 }
 
 #[test]
-fn nothing_is_stepped_while_a_list_is_too_short() {
+fn nothing_steps_while_a_list_is_too_short() {
     for gpu in layouts() {
         let mut exposures = Exposures::new(&gpu, 3).unwrap();
         exposures.prepare(&gpu, [20, 10]).unwrap();
@@ -120,7 +124,7 @@ fn exposed(iterations: u32) -> TrainConfig {
     TrainConfig { exposure: true, ..config(iterations) }
 }
 
-/// The same photographs at other exposures.
+/// The same photographs with photograph i scaled by `gain(i)`.
 pub fn darkened(photographs: &InMemory, gain: impl Fn(usize) -> f32) -> InMemory {
     let mut photographs = photographs.clone();
     for (i, image) in photographs.images.iter_mut().enumerate() {
@@ -138,7 +142,8 @@ fn views_of_two_exposures_give_a_model_of_their_mean_exposure() {
     let Some(gpu) = device() else { return };
     let turns = |first: f64| -> Vec<f64> { (0..8).map(|i| first + 0.25 * f64::from(i)).collect() };
     let photographs = photographs_from(&gpu, &truth(), 64, 48, &turns(-0.9));
-    // Photographs of exposures 0.6 and 1, in turn; held-out views between them at the mean exposure.
+    // Photographs alternate between the exposures 0.6 and 1. Held-out views lie between them and have the
+    // mean exposure.
     let seen = darkened(&photographs, |i| if i % 2 == 0 { 0.6 } else { 1.0 });
     let held_out = darkened(&photographs_from(&gpu, &truth(), 64, 48, &turns(-0.775)), |_| 0.8);
     let trained = |config: TrainConfig| {
@@ -153,7 +158,7 @@ fn views_of_two_exposures_give_a_model_of_their_mean_exposure() {
     // Measured: 0.011 against 0.058, 37.4 dB against 32.6 dB.
     assert!(loss < 0.4 * plain_loss, "loss {loss} with exposures, {plain_loss} without");
     assert!(psnr > plain_psnr + 3.0, "held out: {psnr:.2} dB with exposures, {plain_psnr:.2} dB without");
-    // A grey of 0.5 through each exposure.
+    // Each exposure applied to a grey of 0.5.
     let of_grey =
         |rows: &[[f32; 4]; 3]| rows.iter().map(|r| 0.5 * (r[0] + r[1] + r[2]) + r[3]).sum::<f32>() / 3.0;
     let greys: Vec<f32> = exposures.iter().map(of_grey).collect();
@@ -176,11 +181,15 @@ fn exposures_that_do_not_learn_change_no_byte() {
     };
     let still = TrainConfig { exposure_lr: 0.0, exposure_lr_end: 0.0, ..exposed(24) };
     assert_same_model("a rate of 0", &trained(config(24)), &trained(still));
-    assert_ne!(trained(config(24)).means, trained(exposed(24)).means, "exposures that learn");
+    assert_ne!(
+        trained(config(24)).means,
+        trained(exposed(24)).means,
+        "exposures that learn must change the model"
+    );
 }
 
 #[test]
-fn exposures_depend_on_neither_interruptions_nor_lists_nor_bands() {
+fn interruptions_short_lists_and_bands_change_no_byte() {
     let Some(gpu) = device() else { return };
     let photographs = darkened(&photographs(&gpu, 64, 48), |i| 1.0 - 0.1 * i as f32);
     let new = || run(&photographs, exposed(30));

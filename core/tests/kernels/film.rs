@@ -1,4 +1,4 @@
-//! View embeddings (FiLM, eq. 10): kernels against the twin, and what they do in a run.
+//! View embeddings (FiLM, eq. 10): kernels against the twin, and their effect on a run.
 
 use std::sync::Arc;
 
@@ -32,7 +32,7 @@ fn wide(pixels: &[[f32; 4]]) -> Vec<[f64; 3]> {
     pixels.iter().map(|p| [p[0], p[1], p[2]].map(f64::from)).collect()
 }
 
-/// The weights on the device as the twin has them.
+/// The weights on the device, in the layout of the twin.
 fn weights(film: &Film, gpu: &Gpu) -> FilmWeights {
     let rows = film.weights(gpu).unwrap();
     FilmWeights {
@@ -58,15 +58,15 @@ fn assert_near(
 }
 
 #[test]
-fn filmed_colours_gradients_and_steps_of_any_size_are_those_of_the_twin() {
+fn colours_gradients_and_steps_of_any_size_match_the_twin() {
     const VIEWS: u32 = 3;
     for gpu in layouts() {
         let mut film = Film::new(&gpu, &on(16), VIEWS, 7).unwrap();
         let mut twin = FilmState::new(weights(&film, &gpu), VIEWS as usize);
         let (mut seen, mut cells_seen) = ([0; VIEWS as usize], Vec::new());
         let counters = storage(&gpu, &[0_u32; counter::COUNT as usize]);
-        // One cell, cells in one direction, many, and small after large; sides that are no multiple of a
-        // cell.
+        // One cell, cells in one direction, many cells, and a small size after a large one. Not all sides are
+        // multiples of a cell.
         let sizes = [(1, 1), (17, 5), (40, 7), (75, 53), (32, 32), (130, 99), (9, 100), (23, 25)];
         for (k, (width, height)) in sizes.into_iter().enumerate() {
             let (pixels, view, seed) = (width * height, (2 * k as u32) % VIEWS, 600 + k as u32);
@@ -96,17 +96,20 @@ fn filmed_colours_gradients_and_steps_of_any_size_are_those_of_the_twin() {
             let by = fathom_twins::film_backward(&picture, &twin.weights, &embedding, &v);
             let flat =
                 |pixels: &[[f32; 4]]| pixels.iter().flat_map(|p| [p[0], p[1], p[2]]).collect::<Vec<f32>>();
-            // Means of up to 1e3 numbers and a sum of 16 products, of weights that are right to 2e-6 (below).
+            // Means of up to 1e3 numbers and a sum of 16 products; the twin has the weights of the device.
             assert_near(&what, flat(&filmed).into_iter(), expected.into_iter().flatten(), 2e-5);
             let gradients = flat(&v_rendered).into_iter();
             assert_near(&format!("{what}, gradient"), gradients, by.rgb.iter().copied().flatten(), 2e-5);
-            assert!(filmed.iter().zip(&render).all(|(a, b)| a[3] == b[3]), "{what}: alpha stays");
-            assert!(v_rendered.iter().zip(&v_filmed).all(|(a, b)| a[3] == b[3]), "{what}: v of alpha stays");
+            assert!(filmed.iter().zip(&render).all(|(a, b)| a[3] == b[3]), "{what}: alpha must not change");
+            assert!(
+                v_rendered.iter().zip(&v_filmed).all(|(a, b)| a[3] == b[3]),
+                "{what}: the gradient of alpha must not change"
+            );
 
             twin.step(view as usize, &by, RATE.into(), f64::from(RATE) * f64::from(VIEWS).sqrt());
             let embeddings = film.embeddings(&gpu).unwrap();
             let found = embeddings.iter().flatten().flatten().copied();
-            // Adam makes a step of the ratio of two sums, which may cancel to a few digits.
+            // Adam's step is a ratio of two sums, which may cancel to a few digits.
             assert_near(
                 &format!("{what}, embeddings"),
                 found,
@@ -120,7 +123,7 @@ fn filmed_colours_gradients_and_steps_of_any_size_are_those_of_the_twin() {
                     assert!((kernel - expected).abs() < 2e-4, "{what}: {j}: {kernel} and {expected}");
                 }
             }
-            // The next size is compared from where the device is.
+            // The next size starts from the state of the device.
             twin.weights = now;
             for (twin, kernel) in twin.embeddings.iter_mut().zip(&embeddings) {
                 *twin = kernel.map(|pair| pair.map(f64::from));
@@ -131,7 +134,7 @@ fn filmed_colours_gradients_and_steps_of_any_size_are_those_of_the_twin() {
 }
 
 #[test]
-fn nothing_is_stepped_while_a_list_is_too_short_or_outside_of_the_schedule() {
+fn nothing_steps_with_short_lists_or_outside_the_schedule() {
     for gpu in layouts() {
         let mut film = Film::new(&gpu, &on(8), 3, 7).unwrap();
         film.prepare(&gpu, [20, 10]).unwrap();
@@ -162,7 +165,7 @@ fn nothing_is_stepped_while_a_list_is_too_short_or_outside_of_the_schedule() {
 const WATER: Water =
     Water { beta_d: [0.16, 0.06, 0.05], beta_b: [0.13, 0.07, 0.06], b_inf: [0.025, 0.11, 0.19] };
 
-/// Eighteen photographs under water, every other one at six tenths of the brightness.
+/// Eighteen photographs under water; every other one has 0.6 of the brightness.
 fn uneven(gpu: &Arc<Gpu>) -> InMemory {
     let composition = Composition::PixelsSrgb;
     let view = WaterView {
@@ -197,14 +200,14 @@ fn embeddings_that_do_not_learn_change_no_byte() {
     let (still, zeros) = trained(FilmConfig { lr: 0.0, lr_end: 0.0, ..on(16) });
     assert_same_model("a rate of 0", &plain, &still);
     assert!(zeros.iter().flatten().flatten().all(|value| *value == 0.0));
-    // The first epoch that begins in the second half of 24 iterations with 18 views is the second.
+    // With 18 views and 24 iterations, the second epoch is the first to begin in the second half.
     let (late, moved) = trained(FilmConfig { from: 0.5, ..on(16) });
     assert_eq!(moved.iter().filter(|embedding| embedding.iter().flatten().any(|v| *v != 0.0)).count(), 18);
-    assert_ne!(plain.means, late.means, "embeddings that learn");
+    assert_ne!(plain.means, late.means, "embeddings that learn must change the model");
 }
 
 #[test]
-fn views_of_two_exposures_are_fitted_better_and_held_out_pictures_have_no_embedding() {
+fn embeddings_fit_two_exposures_and_stay_out_of_measurements() {
     let Some(gpu) = device() else { return };
     let photographs = uneven(&gpu);
     let trained = |film: FilmConfig| {
@@ -225,7 +228,7 @@ fn views_of_two_exposures_are_fitted_better_and_held_out_pictures_have_no_embedd
             assert!(mean.abs() < 1e-5, "the mean of number {j}, {k} is {mean}");
         }
     }
-    // What is measured on the way is the model alone under its water.
+    // Measurements during a run use the model under its water, without embeddings.
     let measured = trainer.measure(&photographs, || true).unwrap().unwrap().psnr_db;
     let (model, water) = (trainer.gaussians().unwrap(), trainer.water_view().unwrap());
     let mut renderer = Renderer::new(Arc::clone(&gpu), &model).unwrap().with_water(water);
@@ -238,7 +241,7 @@ fn views_of_two_exposures_are_fitted_better_and_held_out_pictures_have_no_embedd
 }
 
 #[test]
-fn embeddings_depend_on_neither_interruptions_nor_lists_nor_bands() {
+fn interruptions_short_lists_and_bands_change_no_byte() {
     let Some(gpu) = device() else { return };
     let photographs = uneven(&gpu);
     let new = || filmed(&photographs, config(40), on(16));

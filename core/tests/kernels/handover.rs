@@ -1,4 +1,4 @@
-//! Runs whose water is exchanged on the way.
+//! Runs whose water is replaced partway through.
 
 use std::sync::Arc;
 
@@ -20,13 +20,13 @@ fn start() -> MediumRun {
 }
 
 fn watery(photographs: &InMemory, medium: MediumRun) -> TrainRun {
-    // Pictures are too small to be halved; harmonics come at once where the water is frozen.
+    // These pictures are too small to be halved. Harmonics start at once while the water is frozen.
     let config = TrainConfig { exposure: true, sh_degree_at: [0.0; 3], ..config(ITERATIONS) };
     TrainRun { medium: Some(medium), ..run(photographs, config) }
 }
 
 #[test]
-fn a_run_goes_on_under_another_water_with_everything_else_as_it_was() {
+fn a_run_continues_under_another_water_with_all_else_unchanged() {
     let Some(gpu) = device() else { return };
     let photographs = photographs(&gpu, 64, 48);
     let new = || watery(&photographs, start());
@@ -36,21 +36,21 @@ fn a_run_goes_on_under_another_water_with_everything_else_as_it_was() {
     let state = whole.checkpoint().unwrap();
     let found = whole.water().unwrap().unwrap();
     whole.advance(ITERATIONS).unwrap();
-    assert_eq!(whole.water().unwrap(), Some(found), "after its part of the run it stays");
+    assert_eq!(whole.water().unwrap(), Some(found), "the water must stay after its part of the run");
     let whole = whole.gaussians().unwrap();
     let with = |water: Water| MediumRun { water, is_free: false, ..start() };
     let hand_over = |water| {
         Trainer::hand_over(Arc::clone(&gpu), new(), &state, Some(with(water)), None).unwrap().unwrap()
     };
 
-    // The same water: nothing has happened. So rates, refinement, harmonics and exposures are those of their
+    // The same water changes nothing: rates, density control, harmonics and exposures continue at their
     // iteration.
     let mut same = hand_over(found);
     assert_eq!(same.progress().iteration, free);
     same.advance(ITERATIONS).unwrap();
     assert_same_model("the same water", &whole, &same.gaussians().unwrap());
 
-    // Another: it stays, J becomes another, and an interrupted run has the bytes of an uninterrupted one.
+    // Another water stays and changes J. An interrupted run has the bytes of an uninterrupted one.
     let other = Water { beta_d: [0.5, 0.25, 0.125], ..found };
     let mut uninterrupted = hand_over(other);
     uninterrupted.advance(5).unwrap();
@@ -58,20 +58,20 @@ fn a_run_goes_on_under_another_water_with_everything_else_as_it_was() {
     uninterrupted.advance(ITERATIONS).unwrap();
     assert_eq!(uninterrupted.water().unwrap().unwrap().beta_d, other.beta_d);
     let model = uninterrupted.gaussians().unwrap();
-    assert_ne!(model.sh_coeffs, whole.sh_coeffs, "the water changed nothing");
+    assert_ne!(model.sh_coeffs, whole.sh_coeffs, "another water must change the colours");
     let mut resumed = hand_over(other);
     resumed.go_to(&checkpoint).unwrap();
     assert_eq!(resumed.progress().iteration, free + 5);
     resumed.advance(ITERATIONS).unwrap();
     assert_same_model("resumed after the exchange", &model, &resumed.gaussians().unwrap());
 
-    // Checkpoints belong to one water.
+    // A checkpoint belongs to one water.
     let mut elsewhere = hand_over(found);
     for foreign in [&checkpoint, &state] {
         assert!(matches!(elsewhere.go_to(foreign), Err(CoreError::Checkpoint(_))));
     }
     elsewhere.advance(ITERATIONS).unwrap();
-    assert_same_model("a refused checkpoint changes nothing", &whole, &elsewhere.gaussians().unwrap());
+    assert_same_model("a refused checkpoint must change nothing", &whole, &elsewhere.gaussians().unwrap());
     let foreign = Trainer::hand_over(Arc::clone(&gpu), new(), &checkpoint, Some(with(found)), None);
     assert!(matches!(foreign, Err(CoreError::Checkpoint(_))), "the state of another run");
     let dry = TrainRun { medium: None, ..new() };
@@ -81,10 +81,10 @@ fn a_run_goes_on_under_another_water_with_everything_else_as_it_was() {
 }
 
 #[test]
-fn only_numbers_that_moved_have_evidence_and_it_grows_with_the_steps() {
+fn only_free_water_parameters_gather_evidence_with_each_step() {
     let Some(gpu) = device() else { return };
     let photographs = photographs(&gpu, 64, 48);
-    // Nothing can move the third and the last, which are known.
+    // The third and the last are known exactly, so nothing can move them.
     let errors = [0.1, 0.1, 0.0, 0.1, 0.1, 0.1, 0.1, 0.1, 0.0];
     let medium = MediumRun { standard_error: Some(errors), ..start() };
     let mut trainer = Trainer::new(Arc::clone(&gpu), watery(&photographs, medium)).unwrap();
@@ -97,9 +97,9 @@ fn only_numbers_that_moved_have_evidence_and_it_grows_with_the_steps() {
         let evidence = trainer.water_evidence().unwrap().unwrap();
         for (i, (now, before)) in evidence.into_iter().zip(last).enumerate() {
             if errors[i] == 0.0 {
-                assert_eq!(now, 0.0, "number {i}");
+                assert_eq!(now, 0.0, "parameter {i}");
             } else {
-                assert!(now > before && now.is_finite(), "number {i}: {now} after {before}");
+                assert!(now > before && now.is_finite(), "parameter {i}: {now} after {before}");
             }
         }
         last = evidence;
@@ -108,13 +108,13 @@ fn only_numbers_that_moved_have_evidence_and_it_grows_with_the_steps() {
     trainer.advance(free - trainer.progress().iteration).unwrap();
     let at_the_end = trainer.water_evidence().unwrap();
     trainer.advance(ITERATIONS).unwrap();
-    assert_eq!(trainer.water_evidence().unwrap(), at_the_end, "frozen steps are no evidence");
+    assert_eq!(trainer.water_evidence().unwrap(), at_the_end, "frozen steps must not add evidence");
     let dry = Trainer::new(Arc::clone(&gpu), run(&photographs, config(8))).unwrap();
     assert_eq!(dry.water_evidence().unwrap(), None);
 }
 
 #[test]
-fn a_run_goes_on_with_the_gaussians_that_stay_and_their_moments_beside_others() {
+fn a_run_continues_with_the_kept_gaussians_beside_new_context() {
     let Some(gpu) = device() else { return };
     let photographs = photographs(&gpu, 64, 48);
     for (what, medium, moments) in
@@ -133,13 +133,13 @@ fn a_run_goes_on_with_the_gaussians_that_stay_and_their_moments_beside_others() 
             Trainer::hand_over(Arc::clone(&gpu), new(), &state, None, beside).unwrap()
         };
 
-        // All stay and nothing else is there: the run as it was, to the bit.
+        // All Gaussians stay without a context: the run continues to the bit.
         let mut same = hand_over(&|_| true, Gaussians::empty(1)).unwrap();
         assert_eq!(same.progress().iteration, 25);
         same.advance(ITERATIONS).unwrap();
         assert_same_model(what, &whole, &same.gaussians().unwrap());
 
-        // Half of them stay; the others are there as they were, and change no more.
+        // Half of them stay. The others become context and no longer change.
         let stays = |mean: [f32; 3]| mean[0] > 0.0;
         let (kept, gone) = then.split_by(stays);
         assert!(kept.len() > 10 && gone.len() > 10, "{} and {}", kept.len(), gone.len());
@@ -153,10 +153,10 @@ fn a_run_goes_on_with_the_gaussians_that_stay_and_their_moments_beside_others() 
         (0..gone.len()).for_each(|row| both.push_from(&gone, row));
         if medium.is_none() {
             let [before, after] = [&then, &both].map(|model| mean_psnr(&gpu, model, &photographs));
-            assert!(after > before, "{what}: {after} dB beside the others, {before} before");
+            assert!(after > before, "{what}: {after} dB beside the context, {before} before");
         }
 
-        // Interrupted, it has the same bytes; beside nothing it has others.
+        // An interrupted run has the same bytes; a run without the context has different ones.
         let mut resumed = hand_over(&stays, gone.clone()).unwrap();
         resumed.go_to(&checkpoint).unwrap();
         assert_eq!(resumed.progress().iteration, 30);
@@ -164,9 +164,9 @@ fn a_run_goes_on_with_the_gaussians_that_stay_and_their_moments_beside_others() 
         assert_same_model(what, &half, &resumed.gaussians().unwrap());
         let mut alone = hand_over(&stays, Gaussians::empty(1)).unwrap();
         let foreign = alone.go_to(&checkpoint);
-        assert!(matches!(foreign, Err(CoreError::Checkpoint(_))), "a checkpoint beside others");
+        assert!(matches!(foreign, Err(CoreError::Checkpoint(_))), "a checkpoint with another context");
         alone.advance(ITERATIONS).unwrap();
-        assert_ne!(alone.gaussians().unwrap().means, half.means, "{what}: the others do not count");
-        assert!(hand_over(&|_| false, gone).is_none(), "nothing is left to train");
+        assert_ne!(alone.gaussians().unwrap().means, half.means, "{what}: the context has no effect");
+        assert!(hand_over(&|_| false, gone).is_none(), "no Gaussian is left to train");
     }
 }

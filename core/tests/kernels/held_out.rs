@@ -1,4 +1,4 @@
-//! Metrics on held-out views while a run goes on.
+//! Metrics on held-out views during a run.
 
 use std::sync::Arc;
 
@@ -9,7 +9,7 @@ use crate::device::device;
 use crate::trainer::{assert_same_model, config, mean_psnr, photographs, photographs_from, run, truth};
 
 #[test]
-fn measuring_gives_the_metrics_of_the_model_as_it_is_and_changes_no_byte() {
+fn measuring_reports_the_current_model_and_changes_no_byte() {
     let Some(gpu) = device() else { return };
     let photographs = photographs(&gpu, 48, 36);
     let held_out = photographs_from(&gpu, &truth(), 48, 36, &[-0.7, 0.1, 0.5]);
@@ -30,13 +30,17 @@ fn measuring_gives_the_metrics_of_the_model_as_it_is_and_changes_no_byte() {
         history[3].psnr_db > history[0].psnr_db + 1.0 && history[3].ssim > history[0].ssim,
         "{history:?}"
     );
-    assert_eq!(measured.measure(&held_out, || false).unwrap(), None, "told to stop");
+    assert_eq!(
+        measured.measure(&held_out, || false).unwrap(),
+        None,
+        "a cancelled measurement must return nothing"
+    );
     let (plain, measured) = (plain.gaussians().unwrap(), measured.gaussians().unwrap());
-    assert_same_model("with measurements on the way", &plain, &measured);
+    assert_same_model("with measurements during the run", &plain, &measured);
 }
 
 #[test]
-fn how_often_is_measured_is_no_part_of_the_run() {
+fn the_measuring_interval_is_not_part_of_the_run() {
     let Some(gpu) = device() else { return };
     let photographs = photographs(&gpu, 32, 24);
     let mut trainer = Trainer::new(Arc::clone(&gpu), run(&photographs, config(20))).unwrap();

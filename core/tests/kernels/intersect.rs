@@ -1,4 +1,4 @@
-//! Which tiles hold which splats, in which order.
+//! Tile lists: which splats each tile holds, and in which order.
 
 use fathom_core::gaussians::Gaussians;
 use fathom_twins::{Splat, min_sigma_in_rect, samples};
@@ -7,7 +7,7 @@ use crate::bounds::EPSILON;
 use crate::device::layouts;
 use crate::view::{Scene, View, hard_scenes};
 
-/// Compares every tile with an exhaustive search; gives pairs in all, and those that slack added.
+/// Compares every tile with an exhaustive search. Returns the number of pairs and of those that slack added.
 #[track_caller]
 fn check(view: &View) -> (usize, usize) {
     let (scene, splats, lists) = (&view.scene, view.splats(), view.tile_lists());
@@ -37,7 +37,7 @@ fn check(view: &View) -> (usize, usize) {
             if least <= splat.extent - rounding {
                 assert_eq!(listed[id], 1, "{}: missing", what());
             }
-            // The slack of tiles.wgsl: a part in 1e4, and 1e-4.
+            // The slack of tiles.wgsl: a relative and an absolute 1e-4.
             if least > splat.extent * 1.0001 + 1e-4 + rounding {
                 assert_eq!(listed[id], 0, "{}: too far", what());
             }
@@ -47,15 +47,15 @@ fn check(view: &View) -> (usize, usize) {
         for pair in ids.windows(2) {
             let depth = |id: usize| splats[id].map_or(f64::NAN, |splat| splat.depth);
             let (front, back) = (depth(pair[0]), depth(pair[1]));
-            // z is three products and sums of numbers below 10.
+            // z is a sum of three products of numbers below 10.
             assert!(front <= back + 40.0 * EPSILON, "{}: tile {x}, {y}: {front} before {back}", scene.name);
         }
     }
     (pairs, extra)
 }
 
-/// Error of sigma in f32: its terms may be far larger than their sum. Near the tips of a needle the box, from
-/// the same conic, errs by a share of the extent that goes with the condition.
+/// Error of sigma in f32: its terms may be far larger than their sum. The box comes from the same conic. Near
+/// the tips of a needle, its error is a share of the extent that grows with the condition number.
 fn rounding(splat: &Splat, low: [f64; 2], high: [f64; 2]) -> f64 {
     let [a, b, c] = splat.conic;
     let near = |k: usize| (splat.mean2d[k].clamp(low[k], high[k]) - splat.mean2d[k]).abs() + high[k] - low[k];
@@ -94,7 +94,7 @@ fn pictures_smaller_than_a_tile_have_one() {
 fn equal_depths_are_ordered_by_index() {
     for gpu in layouts() {
         let mut model = Gaussians::empty(0);
-        // 3,000 of one depth: more than a workgroup of the sort takes.
+        // 3,000 splats of one depth exceed one workgroup of the sort.
         let one = samples::random(113, 1, 0);
         (0..3000).for_each(|_| model.push_from(&one, 0));
         model.means.fill([0.1, 0.0, 0.2]);

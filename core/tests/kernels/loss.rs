@@ -26,7 +26,7 @@ fn render(seed: u32, pixels: u32) -> Vec<[f32; 4]> {
     (0..pixels).map(|i| [u(i, 0), u(i, 1), u(i, 2), 1.0]).collect()
 }
 
-/// Value and gradient by the kernels, on buffers full of rubbish.
+/// Value and gradient from the kernels, on buffers full of rubbish.
 fn on_device(
     gpu: &Gpu,
     loss: &mut Loss,
@@ -38,7 +38,7 @@ fn on_device(
     for buffer in loss.scratch().unwrap() {
         poison(gpu, buffer);
     }
-    // Nobody writes the alpha entry: it stays the 0 that the buffer was made with.
+    // No kernel writes the alpha entry, so it keeps the initial 0 of the buffer.
     gpu.write(loss.v_image().unwrap(), 0, &vec![[f32::NAN, f32::NAN, f32::NAN, 0.0]; render.len()]);
     let image = storage(gpu, render);
     let mut recorder = Recorder::new(gpu);
@@ -54,7 +54,7 @@ fn check(gpu: &Arc<Gpu>, what: &str, loss: &mut Loss, render: &[[f32; 4]], truth
     check_in(LossLight::Srgb, gpu, what, loss, render, truth, weight);
 }
 
-/// `loss` is one in this light.
+/// As [`check`] for a `loss` in this light.
 #[track_caller]
 fn check_in(
     light: LossLight,
@@ -68,7 +68,7 @@ fn check_in(
     let (width, height) = (truth.width, truth.height);
     let (value, v_image) = on_device(gpu, loss, render, truth, weight);
     let render64: Vec<[f64; 3]> = render.iter().map(|p| [p[0], p[1], p[2]].map(f64::from)).collect();
-    // The photograph as the kernel sees it, rounded to f32, so that equal stays equal.
+    // The photograph as the kernel sees it, rounded to f32, so that equal values stay equal.
     let (_, mask) = fathom_twins::unpack(truth);
     let colours = |p: &u32| {
         p.to_le_bytes().map(|v| match light {
@@ -79,11 +79,11 @@ fn check_in(
     let truth64: Vec<[f64; 3]> =
         truth.pixels.iter().map(|p| [colours(p)[0], colours(p)[1], colours(p)[2]]).collect();
     let twin = fathom_twins::loss(&render64, &truth64, &mask, width, height, f64::from(weight));
-    // 1e-5: a sum of at most 1e4 numbers of order 1 in two levels.
+    // 1e-5: a sum in two levels of at most 1e4 numbers near 1.
     assert!((f64::from(value) - twin.total).abs() < 1e-5, "{what}: loss {value}, twin {}", twin.total);
-    // In units of one pixel's L1 gradient, 1/(3HW). SSIM divides by variances, differences of rounded squares
-    // (1.2e-7) over at least C2 = 9e-4, and by that once more in the derivative: up to 1.2e-7 / 9e-4 = 1.3e-4
-    // of derivatives of some tens where a window is flat.
+    // In units of the L1 gradient of one pixel, 1/(3HW). SSIM divides by variances, which are differences of
+    // rounded squares (1.2e-7), plus C2 = 9e-4. The derivative divides by them once more. Where a window is
+    // flat, the error is up to 1.2e-7 / 9e-4 = 1.3e-4 of derivatives of some tens.
     let unit = 1.0 / (3.0 * f64::from(width * height));
     let tolerance = unit * (1e-5 + f64::from(weight) * 1e-2);
     for (i, v) in v_image.iter().enumerate() {
@@ -94,14 +94,15 @@ fn check_in(
                 "{what}: gradient of pixel {i}, channel {c}: kernel {kernel:e}, twin {twin:e}, tolerance {tolerance:e}"
             );
         }
-        assert_eq!(v[3], 0.0, "{what}: alpha of pixel {i} has no gradient");
+        assert_eq!(v[3], 0.0, "{what}: alpha of pixel {i} must have no gradient");
     }
 }
 
 #[test]
-fn loss_and_gradient_of_any_size_are_those_of_the_twin() {
+fn loss_and_gradient_of_any_size_match_the_twin() {
     for gpu in layouts() {
-        // One loss for all, so that a small picture follows a large one and a long one a square one.
+        // One loss object for all sizes, so that a small picture follows a large one and a long one a square
+        // one.
         let mut loss = Loss::new(&gpu).unwrap();
         for (width, height) in
             [(16, 16), (17, 1), (200, 1), (1, 33), (1, 1), (75, 53), (11, 11), (100, 9), (9, 100)]
@@ -116,7 +117,7 @@ fn loss_and_gradient_of_any_size_are_those_of_the_twin() {
 }
 
 #[test]
-fn in_linear_light_the_photograph_is_decoded_and_the_render_is_not() {
+fn in_linear_light_only_the_photograph_is_decoded() {
     for gpu in layouts() {
         let mut loss = Loss::new(&gpu).unwrap().in_light(LossLight::Linear);
         for (width, height) in [(75, 53), (17, 1), (1, 33), (16, 16)] {
@@ -170,7 +171,7 @@ fn a_pixel_counts_only_where_its_mask_byte_is_255() {
 }
 
 #[test]
-fn what_a_masked_pixel_holds_changes_nothing() {
+fn the_value_of_a_masked_pixel_changes_nothing() {
     for gpu in layouts() {
         let mut loss = Loss::new(&gpu).unwrap();
         let truth = photograph(12, 40, 30, |i| (i % 5 == 0).then_some(0));
@@ -183,7 +184,7 @@ fn what_a_masked_pixel_holds_changes_nothing() {
         }
         let (other_value, other_v_image) = on_device(&gpu, &mut loss, &image, &other, 0.2);
         assert_same_bits("loss", &[value], &[other_value]);
-        // Not by bits: a masked pixel's 0 may have either sign.
+        // Not by bits: the 0 of a masked pixel may have either sign.
         assert_eq!(v_image, other_v_image);
     }
 }
@@ -200,6 +201,6 @@ fn a_perfect_render_has_no_loss_and_no_gradient() {
         assert!(value.abs() < 1e-5, "loss {value}");
         let unit = 1.0 / (3.0 * 33.0 * 21.0);
         let largest = v_image.iter().flatten().fold(0.0_f32, |m, v| m.max(v.abs()));
-        assert!(largest < 1e-3 * unit, "gradient {largest:e}, an L1 gradient is {unit:e}");
+        assert!(largest < 1e-3 * unit, "gradient {largest:e}; an L1 gradient is {unit:e}");
     }
 }

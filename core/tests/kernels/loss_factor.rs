@@ -1,5 +1,5 @@
-//! A factor on the whole loss of a run (SMP-UWGS section 3.1, "Depth-Adaptive Gradient Modulation"): what it
-//! changes under Adam, and what it does not.
+//! A factor on the whole loss of a run (SMP-UWGS section 3.1, "Depth-Adaptive Gradient Modulation") and its
+//! effect under Adam.
 
 use std::sync::Arc;
 
@@ -13,8 +13,8 @@ use crate::device::device;
 use crate::trainer::{grey, photographs, truth};
 use crate::water::fixed;
 
-/// The truth in grey, but turned as it is: of a Gaussian without a turn the gradient by its quaternion begins
-/// as rounding alone, which is as small as what stands under Adam's fraction.
+/// The true Gaussians in grey, with their rotations. Without a rotation, the gradient of a quaternion starts
+/// as pure rounding error. That error is as small as Adam's epsilon.
 fn start() -> Gaussians {
     Gaussians { quats: truth().quats, ..grey(&truth()) }
 }
@@ -34,7 +34,7 @@ fn trained(gpu: &Arc<Gpu>, config: &TrainConfig, views: &InMemory, medium: Optio
     trainer.gaussians().unwrap()
 }
 
-/// Largest difference of two models' centres, scene units, and of their constant colours.
+/// Largest difference between the centres of two models, scene units, and between their constant colours.
 fn difference(a: &Gaussians, b: &Gaussians) -> [f32; 2] {
     assert_eq!(a.len(), b.len());
     let largest = |a: &[[f32; 3]], b: &[[f32; 3]]| {
@@ -44,7 +44,7 @@ fn difference(a: &Gaussians, b: &Gaussians) -> [f32; 2] {
 }
 
 #[test]
-fn a_factor_on_the_whole_loss_is_next_to_nothing_under_adam() {
+fn a_factor_on_the_loss_changes_almost_nothing_under_adam() {
     let Some(gpu) = device() else { return };
     let views = photographs(&gpu, 64, 48);
     let config = |loss_factor| TrainConfig {
@@ -52,19 +52,19 @@ fn a_factor_on_the_whole_loss_is_next_to_nothing_under_adam() {
         max_gaussians: 120,
         sh_degree: 1,
         resolution_at: [0.0; 2],
-        // Compact moments round the logarithm of a gradient, of which a factor moves every one by as much.
+        // Compact moments round the logarithm of a gradient, and a factor shifts all logarithms.
         moments: Moments::F32,
         loss_factor,
         ..TrainConfig::default()
     };
-    // A water that stays, with every term of the loss that a water adds.
+    // A frozen water, with every loss term that a water adds.
     let water = |medium| {
         let mut water = WaterConfig { medium, ..WaterConfig::default() };
         (water.priors.dark_channel, water.priors.depth_smoothness) = (1.0, 2.0);
         Some(MediumRun { is_free: false, ..fixed(&water, 3.2) })
     };
-    // A power of two leaves every mantissa as it is. Another one rounds the gradients anew; where the water
-    // acts on pixels they are divided by alphas that may be small, so roundings grow.
+    // A power of two preserves every mantissa. Any other factor changes the rounding of the gradients. Where
+    // the water acts on pixels, gradients are divided by alphas that may be small, which amplifies rounding.
     for (medium, rounded) in
         [(None, 1e-2), (water(Medium::PerGaussian), 1e-2), (water(Medium::PerPixel), 5e-2)]
     {
@@ -76,7 +76,7 @@ fn a_factor_on_the_whole_loss_is_next_to_nothing_under_adam() {
             for (scaled, moved) in scaled.into_iter().zip(moved) {
                 assert!(
                     scaled <= allowed * moved,
-                    "factor {factor}: {scaled}, where another seed moves by {moved}"
+                    "factor {factor}: {scaled}, but another seed moves by {moved}"
                 );
             }
         }
@@ -84,7 +84,7 @@ fn a_factor_on_the_whole_loss_is_next_to_nothing_under_adam() {
 }
 
 #[test]
-fn the_threshold_of_classic_density_control_is_what_a_factor_on_the_loss_moves() {
+fn a_factor_on_the_loss_shifts_the_classic_density_threshold() {
     let Some(gpu) = device() else { return };
     let views = photographs(&gpu, 64, 48);
     let gaussians = |loss_factor: f32, gradient: f32| {
@@ -103,6 +103,6 @@ fn the_threshold_of_classic_density_control_is_what_a_factor_on_the_loss_moves()
         trained(&gpu, &config, &views, None).len()
     };
     let (plain, halved) = (gaussians(1.0, 8e-3), gaussians(0.5, 8e-3));
-    assert!(halved < plain, "{halved} with half of the loss, {plain} without");
-    assert_eq!(halved, gaussians(1.0, 1.6e-2), "the same as with the threshold doubled");
+    assert!(halved < plain, "{halved} with half the loss, {plain} with all of it");
+    assert_eq!(halved, gaussians(1.0, 1.6e-2), "half the loss must equal twice the threshold");
 }

@@ -1,10 +1,9 @@
-//! Every kernel of `shaders/` on a real adapter against its f64 twin of `fathom_twins`.
+//! Compares every kernel of `shaders/` on a real adapter with its f64 twin in `fathom_twins`.
 //!
-//! Kernel by stage, a twin is fed with what the kernels gave for the stage before, so that tolerances need to
-//! cover one stage only. They come from the forward error bound of the formula at hand, with the constants of
-//! `device.rs`; where blending has an edge (alpha of 1/255, the end of a ray, the cap), what lies within the
-//! bound of it is counted. Runs on a CPU adapter too (lavapipe), about a minute on two cores: pictures are
-//! small, but never a multiple of a tile.
+//! Each twin gets the output of the kernels of the previous stage, so tolerances cover one stage only. They
+//! come from the forward error bound of each formula. Blending has edges (alpha of 1/255, the end of a ray,
+//! the cap); decisions within the bound of an edge are counted. The tests also run on a CPU adapter
+//! (lavapipe), in about a minute on two cores. Pictures are small, but never a multiple of a tile.
 
 #![expect(clippy::unwrap_used, reason = "a test may stop at what it did not expect")]
 

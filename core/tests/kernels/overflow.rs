@@ -1,5 +1,5 @@
-//! What must not change a result: rubbish in buffers, short lists, how Gaussians are spread over blocks,
-//! broken neighbours.
+//! Conditions that must not change a result: rubbish in buffers, short lists, other blocks, broken
+//! neighbours.
 
 use fathom_core::config::Moments;
 use fathom_core::gaussians::Gaussians;
@@ -46,7 +46,7 @@ fn checks_at_run_time_change_no_byte() {
 }
 
 #[test]
-fn a_list_that_is_too_short_says_what_it_needs_and_later_frames_do_nothing() {
+fn a_short_list_reports_its_need_and_stops_later_frames() {
     for gpu in layouts() {
         let scene = &hard_scenes(73, 300, 0)[0];
         let ample = View::render(&gpu, scene);
@@ -68,7 +68,7 @@ fn a_list_that_is_too_short_says_what_it_needs_and_later_frames_do_nothing() {
         let mut frame = Frame::new(&gpu, 300, 1, 1).unwrap();
         frame.prepare_targets(&gpu, view.uniform.size).unwrap();
         assert_eq!(run(&frame), Some(Overflow { failed_at: 5, visible, intersections: 0 }));
-        // What was queued after the failure rendered nothing and left the first failure standing.
+        // Work that was queued after the failure rendered nothing and kept the first failure.
         let counters: Vec<u32> = gpu.read(&frame.counters, 0, 3).unwrap();
         assert_eq!(counters[counter::VISIBLE as usize..], [0, 0]);
 
@@ -105,7 +105,7 @@ fn lists_that_just_fit_do_not_overflow() {
     }
 }
 
-/// Model `from..to`.
+/// Gaussians `from..to` of the model.
 fn part(model: &Gaussians, from: usize, to: usize) -> Gaussians {
     let mut part = Gaussians::empty(model.sh_degree);
     (from..to).for_each(|index| part.push_from(model, index));
@@ -149,16 +149,17 @@ fn blocks_and_frozen_context_give_the_bytes_of_one_block() {
 }
 
 #[test]
-fn a_block_that_is_still_empty_takes_nothing_from_the_one_before() {
+fn an_empty_block_takes_nothing_from_the_block_before_it() {
     for gpu in layouts() {
         let scene = Scene::new("room to grow", samples::random(78, 200, 0), 75, 53);
         let whole = View::render(&gpu, &scene);
-        // A cap beyond one block: the second has room but no Gaussian yet.
+        // The cap needs a second block, which has no Gaussian yet.
         let mut blocks = Blocks::new(&gpu, 0).unwrap();
         blocks.push_trainable(&gpu, &scene.model, BLOCK_CAPACITY + 64, Moments::F32).unwrap();
         assert_eq!(blocks.iter().len(), 2);
         let mut roomy = View::prepare(&gpu, &scene, blocks);
-        // Lists as a trainer makes them: by the cap, not by the count; entries behind the count are rubbish.
+        // Lists are sized by the cap, as in a trainer, not by the count; entries beyond the count are
+        // rubbish.
         roomy.frame = Frame::new(&gpu, 1024, 1024, 16_384).unwrap();
         roomy.frame.prepare_targets(&gpu, roomy.uniform.size).unwrap();
         for rubbish in [0_u32, 0x7FFF_FFFF] {
@@ -178,7 +179,7 @@ fn a_block_that_is_still_empty_takes_nothing_from_the_one_before() {
             assert!(all.means.iter().any(|mean| mean[0] != 0.0));
             let (_, _, training) = roomy.blocks.trainable().nth(1).unwrap();
             let moments: Vec<f32> = gpu.read(&training.moments, 0, 24 * 64).unwrap();
-            assert!(moments.iter().all(|&value| value == 0.0), "nothing is written into the empty block");
+            assert!(moments.iter().all(|&value| value == 0.0), "the empty block must not be written");
         }
     }
 }
@@ -189,7 +190,7 @@ fn broken_gaussians_change_nothing_of_the_others() {
         for degree in [0, 3] {
             let sound = samples::random(80, 150, degree);
             let (broken, faults) = samples::degenerate(degree);
-            // Broken ones before, between and behind the sound ones.
+            // Broken Gaussians before, between and after the sound ones.
             let mut mixed = Gaussians::empty(degree);
             let mut place = Vec::new();
             for index in 0..sound.len() {
@@ -247,9 +248,9 @@ fn each_kind_of_broken_gaussian_leaves_the_background_alone() {
 }
 
 #[test]
-fn a_renderer_grows_its_lists_and_forgets_the_view_before() {
+fn a_renderer_grows_its_lists_and_forgets_the_previous_view() {
     for gpu in layouts() {
-        // Huge splats in many tiles: more intersections than a renderer starts with.
+        // Huge splats in many tiles exceed the initial intersection lists of a renderer.
         let scene = Scene::new("huge", samples::huge(82, 400, 0), 128, 96);
         let expected = View::render(&gpu, &scene);
         assert!(expected.counter(counter::INTERSECTIONS) > 4096, "the scene must overflow the first lists");
@@ -259,7 +260,7 @@ fn a_renderer_grows_its_lists_and_forgets_the_view_before() {
             let image: Vec<[f32; 3]> = expected.image().iter().map(|p| [p[0], p[1], p[2]]).collect();
             assert_same_bits("image", &image, &rendered.rgb);
             assert_same_bits("range", &expected.range_image(), &rendered.range);
-            // Another size in between.
+            // A picture of another size in between.
             let small = scene.camera.resized(33, 20);
             assert_eq!(renderer.render(&small, &scene.pose, scene.background).unwrap().rgb.len(), 33 * 20);
         }

@@ -1,4 +1,4 @@
-//! WaterParamPredict in a run: what it does to the water, and that nothing but the iteration decides it.
+//! WaterParamPredict in a run: its effect on the water, which depends on nothing but the iteration.
 
 use std::sync::Arc;
 
@@ -16,8 +16,8 @@ use crate::water::{WATER, gradients_of, medium_run, watery, with};
 
 const PER_GAUSSIAN: (Medium, Blend) = (Medium::PerGaussian, Blend::Srgb);
 const PER_PIXEL: (Medium, Blend) = (Medium::PerPixel, Blend::Linear);
-/// Of 24 iterations the network decides the first 11. With a cadence of 3 it is asked at 3, 6 and 9, and what
-/// it says enters at 6 and 9.
+/// The network sets the water in the first 11 of 24 iterations. With a cadence of 3, predictions start at 3,
+/// 6 and 9; those of 3 and 6 take effect at 6 and 9.
 const ITERATIONS: u32 = 24;
 const END: u32 = 11;
 
@@ -33,7 +33,7 @@ fn every(every: u32, depth_gradient: bool) -> NetworkConfig {
     }
 }
 
-/// A run whose water the network decides at first.
+/// A run whose water comes from the network at first.
 fn predicted(photographs: &InMemory, composed: (Medium, Blend), network: NetworkConfig) -> TrainRun {
     let water = WaterConfig { prior: WaterPrior::Network, network, ..with(composed) };
     let mut run = watery(photographs, config(ITERATIONS), water);
@@ -43,8 +43,8 @@ fn predicted(photographs: &InMemory, composed: (Medium, Blend), network: Network
     run
 }
 
-/// The ways that a run can go: on a thread with either medium, and at once.
-fn ways() -> [((Medium, Blend), NetworkConfig); 3] {
+/// The modes of prediction: on a thread with either medium, and within the iteration.
+fn modes() -> [((Medium, Blend), NetworkConfig); 3] {
     [(PER_GAUSSIAN, every(3, false)), (PER_PIXEL, every(4, false)), (PER_PIXEL, every(0, true))]
 }
 
@@ -53,7 +53,7 @@ fn record_of(trainer: &Trainer) -> WaterRecord {
 }
 
 #[test]
-fn the_water_is_what_the_network_says_and_enters_a_cadence_later() {
+fn a_prediction_becomes_the_water_one_cadence_later() {
     let Some(gpu) = device() else { return };
     let photographs = photographs(&gpu, 64, 48);
     let mut trainer =
@@ -64,49 +64,50 @@ fn the_water_is_what_the_network_says_and_enters_a_cadence_later() {
         waters.push(trainer.water().unwrap().unwrap());
     }
     let changes: Vec<usize> = (1..waters.len()).filter(|&at| waters[at] != waters[at - 1]).collect();
-    assert_eq!(changes, [6, 9, 11], "the first prediction is asked for at 3");
+    assert_eq!(changes, [6, 9, 11], "the first prediction starts at 3");
     for (water, what) in waters.iter().zip(0..) {
         assert!(water.is_physical(), "{what}: {water:?}");
         for (k, (now, start)) in water.to_array().iter().zip(waters[0].to_array()).enumerate() {
-            assert!((now / start - 1.0).abs() < 0.5, "{what}, {k}: it begins near {start}: {now}");
+            assert!((now / start - 1.0).abs() < 0.5, "{what}, {k}: {now} must stay near the start, {start}");
         }
     }
 }
 
 #[test]
-fn a_run_with_a_network_depends_on_neither_timing_nor_interruptions_nor_lists_nor_bands() {
+fn timing_interruptions_lists_and_bands_change_no_byte() {
     let Some(gpu) = device() else { return };
     let photographs = photographs(&gpu, 64, 48);
-    let [on_a_thread, _, at_once] = ways();
+    let [on_a_thread, _, at_once] = modes();
     for (composed, network) in [on_a_thread, at_once] {
         let new = || predicted(&photographs, composed, network.clone());
         let learnt = |trainer: &mut Trainer| (record_of(trainer), trainer.checkpoint().unwrap());
         let what = format!("{composed:?}, every {}", network.every);
-        // Every iteration of two cadences, with predictions on their way, and across the end.
+        // Every iteration of two cadences, with pending predictions, and across the end of the network's
+        // part.
         same_however_it_runs(&gpu, &what, new, 3..13, BANDED, learnt);
     }
 }
 
 #[test]
-fn the_end_of_its_part_makes_one_water_from_where_descent_begins_anew() {
+fn descent_starts_afresh_from_the_last_predicted_water() {
     let Some(gpu) = device() else { return };
     let photographs = photographs(&gpu, 64, 48);
-    for (composed, network) in ways() {
+    for (composed, network) in modes() {
         let what = format!("{composed:?}, every {}", network.every);
         let new = |until: f32| {
             let mut run = predicted(&photographs, composed, network.clone());
             run.medium.as_mut().unwrap().config.freeze_at = until;
             run
         };
-        // Without descent its word is the last.
-        let mut last_word = Trainer::new(Arc::clone(&gpu), new(network.until)).unwrap();
-        last_word.advance(END).unwrap();
-        let decided = record_of(&last_word);
+        // Without descent, the last prediction is final.
+        let mut predicted_only = Trainer::new(Arc::clone(&gpu), new(network.until)).unwrap();
+        predicted_only.advance(END).unwrap();
+        let decided = record_of(&predicted_only);
         assert_eq!(decided.source, "network", "{what}");
-        // No points say how true it is, and views that agree do not.
+        // No sparse points support it, and agreement between views gives no error estimate.
         assert_eq!(decided.standard_error.to_array(), [f64::INFINITY; 9], "{what}");
-        last_word.advance(ITERATIONS).unwrap();
-        assert_eq!(record_of(&last_word), decided, "{what}: it stays");
+        predicted_only.advance(ITERATIONS).unwrap();
+        assert_eq!(record_of(&predicted_only), decided, "{what}: the water must stay");
 
         let mut descends = Trainer::new(Arc::clone(&gpu), new(0.667)).unwrap();
         descends.advance(END).unwrap();
@@ -115,7 +116,7 @@ fn the_end_of_its_part_makes_one_water_from_where_descent_begins_anew() {
         descends.advance(1).unwrap();
         let after = record_of(&descends);
         assert_eq!(after.standard_error, before.standard_error);
-        // The first step of Adam is its rate, whatever the gradient: no moments are left of before.
+        // Adam's first step equals its rate at any gradient, so no earlier moments remain.
         let rate = f64::from(WaterConfig::default().lr);
         let raw = |record: &WaterRecord| record.water().to_raw(3.2);
         for (k, (after, before)) in raw(&after).iter().zip(raw(&before)).enumerate() {
@@ -126,7 +127,7 @@ fn the_end_of_its_part_makes_one_water_from_where_descent_begins_anew() {
 }
 
 #[test]
-fn gathered_gradients_are_the_sums_of_those_of_the_twin_over_the_sound_iterations() {
+fn gathered_gradients_are_the_twins_sums_over_sound_iterations() {
     let decay = 1e-3;
     for gpu in layouts() {
         let mut frame = Frame::new(&gpu, 1, 1, 1).unwrap();
@@ -149,7 +150,7 @@ fn gathered_gradients_are_the_sums_of_those_of_the_twin_over_the_sound_iteration
         let state = WaterState::new(&WATER, 3.2);
         let mut expected = [0.0; 9];
         for iteration in 0..4 {
-            // One of them is not finite, and is left out.
+            // One of the gradients is not finite and is left out.
             let bad = iteration == 2;
             let v: Vec<[f32; 4]> = (0..64)
                 .map(|i| {
@@ -196,9 +197,9 @@ fn gathered_gradients_are_the_sums_of_those_of_the_twin_over_the_sound_iteration
             assert!((f64::from(*found) - expected).abs() < 1e-5 * size, "{k}: {found} and {expected}");
         }
         let empty = water.take_gathered(&gpu).unwrap();
-        assert_eq!((empty.v_raw, empty.iterations), ([0.0; 9], 0), "the sums start anew");
+        assert_eq!((empty.v_raw, empty.iterations), ([0.0; 9], 0), "the sums must be reset");
         assert_same_bits(
-            "the water stays",
+            "the water must stay",
             &before.to_array(),
             &water.water(&gpu, &frame).unwrap().to_array(),
         );
@@ -206,7 +207,7 @@ fn gathered_gradients_are_the_sums_of_those_of_the_twin_over_the_sound_iteration
 }
 
 #[test]
-fn the_gradient_of_the_depth_map_moves_gaussians_and_only_where_it_is_asked_for() {
+fn the_depth_gradient_moves_gaussians_only_when_it_is_on() {
     let Some(gpu) = device() else { return };
     let photographs = photographs(&gpu, 64, 48);
     let means = |depth_gradient: bool| {
@@ -216,7 +217,7 @@ fn the_gradient_of_the_depth_map_moves_gaussians_and_only_where_it_is_asked_for(
         (trainer.water().unwrap(), trainer.gaussians().unwrap().means)
     };
     let (with, without) = (means(true), means(false));
-    assert_eq!(with.0, without.0, "the first prediction is the same");
+    assert_eq!(with.0, without.0, "the first prediction must be the same");
     assert_ne!(with.1, without.1);
     assert_eq!(with.1, means(true).1);
 }
@@ -237,15 +238,15 @@ fn a_frozen_water_ignores_the_network() {
         (trainer.gaussians().unwrap(), trainer.checkpoint().unwrap().len())
     };
     let ((with, bytes), (without, fewest)) = (train(true), train(false));
-    assert_same_model("with a network that has nothing to say", &with, &without);
-    assert_eq!(bytes, fewest, "and nothing of it in a checkpoint");
+    assert_same_model("with a network that is not used", &with, &without);
+    assert_eq!(bytes, fewest, "a checkpoint must not contain the network");
 }
 
 #[test]
-fn a_network_that_diverges_leaves_a_sound_water_whose_spread_nobody_knows() {
+fn a_diverged_network_leaves_a_sound_water_of_unknown_error() {
     let Some(gpu) = device() else { return };
     let photographs = photographs(&gpu, 48, 36);
-    for (composed, network) in ways() {
+    for (composed, network) in modes() {
         let network = NetworkConfig { learning_rate: 1e30, ..network };
         let mut run = predicted(&photographs, composed, network.clone());
         run.medium.as_mut().unwrap().config.freeze_at = network.until;

@@ -1,4 +1,4 @@
-//! Priors under water, and the loss in linear light: kernels against the twins, and what they do in a run.
+//! Priors under water, and the loss in linear light: kernels against the twins, and their effect on a run.
 
 use std::sync::Arc;
 
@@ -16,14 +16,14 @@ use fathom_twins::{
 
 use crate::device::{assert_same_bits, device, layouts, poison, storage};
 use crate::trainer::{assert_same_model, config, photographs};
-use crate::water::{WAYS, fixed, sums, watery, with};
+use crate::water::{COMPOSITIONS, fixed, sums, watery, with};
 
 const WATER: Water =
     Water { beta_d: [0.32, 0.11, 0.08], beta_b: [0.26, 0.14, 0.11], b_inf: [0.3, 0.41, 0.49] };
 const UNIT: f64 = 3.2;
 const TERMS: f32 = 0.5;
 
-/// What a picture's gradients are compared on.
+/// The inputs of one comparison of gradients.
 struct Picture {
     size: [u32; 2],
     image: Vec<[f32; 4]>,
@@ -33,7 +33,7 @@ struct Picture {
 }
 
 impl Picture {
-    /// Noise: some pixels open water, some nearly, some whole, the rest anything.
+    /// Noise: some pixels are open water, some almost, half are opaque, the rest have any alpha.
     fn random(seed: u32, size: [u32; 2], masked: f32) -> Self {
         let pixels = size[0] * size[1];
         let u = |i, j| uniform_at(seed, Stream::Test, i, j);
@@ -57,7 +57,7 @@ impl Picture {
         }
     }
 
-    /// One colour, alpha and range all over: every pixel of a patch is its darkest.
+    /// One colour, alpha and range everywhere, so every pixel of a patch is its darkest.
     fn flat(size: [u32; 2]) -> Self {
         let pixels = (size[0] * size[1]) as usize;
         Self {
@@ -70,8 +70,8 @@ impl Picture {
     }
 }
 
-/// Gradients that the kernels leave: by what was blended and its alpha, by range, by the nine numbers; and
-/// what was seen.
+/// Gradients from the kernels with respect to the blended colour and alpha, the range and the water
+/// parameters; and the formed picture.
 struct Found {
     v_image: Vec<[f32; 4]>,
     v_range: Vec<f32>,
@@ -80,13 +80,13 @@ struct Found {
     seen: Vec<[f32; 4]>,
 }
 
-/// Of maps.
+/// The range modulation of `DbdrMode::Maps`; `None` in other modes.
 fn refinement_of(config: &WaterConfig) -> Option<RangeModulation> {
     let maps = config.dbdr.mode == DbdrMode::Maps;
     maps.then(|| RangeModulation::identity(2.0, UNIT).with_array([0.25, -0.125, -0.75, 0.5]))
 }
 
-/// Forward and backward by the kernels, at half size, on buffers full of rubbish.
+/// Runs the kernels forward and backward, at half size, on buffers full of rubbish.
 fn by_kernels(gpu: &Arc<Gpu>, picture: &Picture, config: WaterConfig) -> Found {
     let refinement = refinement_of(&config);
     let run = MediumRun { water: WATER, refinement, ..fixed(&config, UNIT) };
@@ -123,7 +123,7 @@ fn by_kernels(gpu: &Arc<Gpu>, picture: &Picture, config: WaterConfig) -> Found {
     }
 }
 
-/// Weights that make gradients of a pixel near 1, whatever the size of the picture.
+/// Weights that make the gradients of a pixel about 1 at any picture size.
 fn weighty(pixels: usize, patch: u32, on: DarkChannelOn) -> PriorsConfig {
     PriorsConfig {
         dark_channel: 0.5 * pixels as f32,
@@ -154,7 +154,8 @@ fn check(gpu: &Arc<Gpu>, what: &str, picture: &Picture, config: &WaterConfig) {
     let bytes = |pixel: &u32| pixel.to_le_bytes().map(|byte| f64::from(byte) / 255.0);
     let photograph: Vec<[f64; 3]> =
         picture.photograph.iter().map(|pixel| [bytes(pixel)[0], bytes(pixel)[1], bytes(pixel)[2]]).collect();
-    // What the kernel saw, so that no pixel is the darkest by the rounding of the stage before.
+    // The picture that the kernel formed, so that rounding in the previous stage does not decide which pixel
+    // is darkest.
     let seen: Vec<[f64; 3]> = found.seen.iter().map(|p| [p[0], p[1], p[2]].map(f64::from)).collect();
     let on_photograph = priors.dark_channel_on == DarkChannelOn::Photograph;
     let shown = if on_photograph { &photograph } else { &seen };
@@ -193,7 +194,7 @@ fn check(gpu: &Arc<Gpu>, what: &str, picture: &Picture, config: &WaterConfig) {
                 (_, false) => encode(formed[c]),
                 (_, true) => (formed[c], 1.0),
             };
-            // 3e-6: a power in f32, of up to two of them.
+            // 3e-6: one or two powers in f32.
             assert!((shown.0 - seen[i][c]).abs() < 3e-6, "{what}: {i}, {c}: {} and {}", seen[i][c], shown.0);
             shown.1 * (f64::from(picture.v[i][c]) + by_light)
         });
@@ -211,7 +212,7 @@ fn check(gpu: &Arc<Gpu>, what: &str, picture: &Picture, config: &WaterConfig) {
         };
         by.alpha += dark.v_alpha[i] + smooth.v_alpha[i];
         by.range += dark.v_range[i] + smooth.v_range[i];
-        // Relative to the largest term: a pixel is the darkest of many patches, and range is divided by
+        // Relative to the largest term: a pixel may be the darkest of many patches, and range is divided by
         // alpha.
         let size = 1.0
             + v.iter().chain(&by.rgb).map(|v| v.abs()).sum::<f64>()
@@ -242,15 +243,15 @@ const LIGHTS: [(DarkChannelOn, LossLight); 4] = [
     (DarkChannelOn::Photograph, LossLight::Linear),
 ];
 
-/// Each with the patch at full size: what is worked on has half of it. One pixel, patches of one pixel, whole
-/// runs of eight, and patches larger than the picture.
+/// Sizes, each with its patch at full size; the kernels use half of the patch. Cases: one pixel, patches of
+/// one pixel, whole runs of eight, and patches larger than the picture.
 const SIZES: [([u32; 2], u32); 6] =
     [([1, 1], 41), ([33, 31], 1), ([32, 16], 5), ([75, 53], 41), ([9, 100], 7), ([29, 3], 255)];
 
 #[test]
-fn gradients_of_priors_through_every_water_are_those_of_the_twins() {
+fn gradients_of_priors_match_the_twins_through_every_water() {
     for gpu in layouts() {
-        for composed in WAYS {
+        for composed in COMPOSITIONS {
             for (on, loss_light) in LIGHTS {
                 for (k, (size, patch)) in SIZES.into_iter().enumerate() {
                     let masked = [0.0, 0.3][k % 2];
@@ -275,7 +276,7 @@ fn gradients_of_priors_through_every_water_are_those_of_the_twins() {
 }
 
 #[test]
-fn gradients_of_priors_through_a_water_that_follows_from_range_are_those_of_the_twins() {
+fn gradients_of_priors_match_the_twins_through_dbdr() {
     for gpu in layouts() {
         for (on, loss_light) in LIGHTS {
             let (size, patch) = ([75, 53], 41);
@@ -294,7 +295,7 @@ fn gradients_of_priors_through_a_water_that_follows_from_range_are_those_of_the_
 }
 
 #[test]
-fn of_equal_pixels_the_first_of_each_patch_takes_the_whole_gradient() {
+fn the_first_of_equal_pixels_in_a_patch_takes_the_gradient() {
     for gpu in layouts() {
         for (size, patch) in SIZES {
             let picture = Picture::flat(size);
@@ -302,7 +303,7 @@ fn of_equal_pixels_the_first_of_each_patch_takes_the_whole_gradient() {
                 alpha_background: 0.0,
                 surface_alpha_weight: 0.0,
                 priors: weighty(picture.image.len(), patch, DarkChannelOn::Render),
-                ..with(WAYS[0])
+                ..with(COMPOSITIONS[0])
             };
             check(&gpu, &format!("flat, {size:?}, patch {patch}"), &picture, &config);
         }
@@ -310,9 +311,9 @@ fn of_equal_pixels_the_first_of_each_patch_takes_the_whole_gradient() {
 }
 
 #[test]
-fn open_water_masked_pictures_and_pixels_that_are_no_numbers_leave_all_else_finite() {
+fn open_water_masks_and_nan_pixels_leave_all_else_finite() {
     for gpu in layouts() {
-        for composed in WAYS {
+        for composed in COMPOSITIONS {
             let size = [41, 23];
             let mut open = Picture::random(440, size, 0.0);
             open.image.fill([0.0; 4]);
@@ -334,7 +335,7 @@ fn open_water_masked_pictures_and_pixels_that_are_no_numbers_leave_all_else_fini
         torn.image[200] = [f32::NAN, f32::NAN, f32::NAN, 1.0];
         torn.image[300] = [f32::INFINITY, f32::NEG_INFINITY, 0.5, 1.0];
         let priors = weighty(torn.image.len(), 41, DarkChannelOn::Render);
-        let found = by_kernels(&gpu, &torn, WaterConfig { priors, ..with(WAYS[0]) });
+        let found = by_kernels(&gpu, &torn, WaterConfig { priors, ..with(COMPOSITIONS[0]) });
         for (i, v) in found.v_image.iter().enumerate().filter(|(i, _)| ![200, 300].contains(i)) {
             assert!(v.iter().chain([&found.v_range[i]]).all(|v| v.is_finite()), "pixel {i}: {v:?}");
         }
@@ -343,10 +344,10 @@ fn open_water_masked_pictures_and_pixels_that_are_no_numbers_leave_all_else_fini
 }
 
 #[test]
-fn priors_without_weight_or_before_their_time_change_no_byte_and_later_they_do() {
+fn priors_act_only_with_a_weight_and_after_their_start() {
     let Some(gpu) = device() else { return };
     let photographs = photographs(&gpu, 64, 48);
-    for composed in WAYS {
+    for composed in COMPOSITIONS {
         let train = |priors: PriorsConfig| {
             let water = WaterConfig { priors, alpha_background: 0.0, ..with(composed) };
             let mut trainer =
@@ -376,13 +377,13 @@ fn priors_without_weight_or_before_their_time_change_no_byte_and_later_they_do()
             PriorsConfig { from: 0.5, ..later },
         ] {
             let (model, _) = train(on.clone());
-            assert!(model.means != plain.means, "{composed:?}: {on:?} does nothing");
+            assert!(model.means != plain.means, "{composed:?}: {on:?} has no effect");
         }
     }
 }
 
 #[test]
-fn smooth_depth_is_what_depth_smoothness_makes() {
+fn depth_smoothness_makes_depth_smoother() {
     let Some(gpu) = device() else { return };
     let photographs = photographs(&gpu, 64, 48);
     let roughness = |weight: f32| {

@@ -1,4 +1,4 @@
-//! Splats: who is visible, and every number of the records.
+//! Splats: which Gaussians are visible, and every number of their records.
 
 use fathom_core::scene::PinholeCamera;
 use fathom_twins::{BLUR, Gaussians64, NEAR, Splat, min_sigma_in_rect, project_forward, samples};
@@ -7,21 +7,21 @@ use crate::bounds::EPSILON;
 use crate::device::device;
 use crate::view::{Scene, View, hard_scenes};
 
-/// Relative error of the covariance, and of its inverse by the condition number of the covariance.
+/// Condition number of the covariance, or slightly more: trace^2 / determinant of the conic.
 fn condition(splat: &Splat) -> f64 {
     let [a, b, c] = splat.conic;
     (a + c).powi(2) / (a * c - b * b)
 }
 
-/// Compares the kernel's splats with the twin's; gives how many are compared and how many decisions were too
-/// close to call.
+/// Compares the kernel's splats with the twin's. Returns the number of compared splats and of decisions
+/// within rounding.
 #[track_caller]
 fn check(view: &View) -> (usize, usize) {
     let scene = &view.scene;
     let (camera, pose) = (&scene.camera, &scene.pose);
     let model = view.drawn();
     let twin = project_forward(&model, camera, pose, scene.sh_degree, &scene.rules());
-    // From the first pixel's centre to the last; tiles at the border reach further.
+    // From the centre of the first pixel to that of the last; tiles at the border reach further.
     let last = [f64::from(camera.width) - 0.5, f64::from(camera.height) - 0.5];
     let reaches = |splat: &Splat| min_sigma_in_rect(splat, [0.5; 2], last) <= splat.extent;
     let kernel = view.splats();
@@ -32,7 +32,7 @@ fn check(view: &View) -> (usize, usize) {
                 compare(scene, camera, &model, id, kernel, twin);
                 compared += 1;
             }
-            // The kernel culls what cannot reach the picture; the twin leaves that to `intersect`.
+            // The kernel culls splats that cannot reach the picture; the twin leaves that to `intersect`.
             (None, Some(twin)) => {
                 assert!(!reaches(twin), "{}: Gaussian {id} must be seen: {twin:?}", scene.name)
             }
@@ -56,7 +56,7 @@ fn compare(
     kernel: &Splat,
     twin: &Splat,
 ) {
-    // Four products and sums for each coordinate in the camera's frame.
+    // Each coordinate in the camera's frame takes four products and sums.
     let size = model.means[id].iter().map(|v| v.abs()).sum::<f64>() + scene.pose.translation.length();
     let position = 4.0 * EPSILON * size;
     // Relative error of anything divided by z.
@@ -66,8 +66,8 @@ fn compare(
     let mean2d = |k: usize| focal[k] * ratio * over_z + 4.0 * EPSILON * twin.mean2d[k].abs();
     let mut opacity = (8.0 + model.opacity_logits[id].abs()) * EPSILON;
     if scene.mip_filter {
-        // The determinant of the covariance, and the area |a_x x a_y| from two vectors that may be nearly
-        // parallel.
+        // Errors of the determinant of the covariance and of the area |a_x x a_y|, whose two vectors may be
+        // nearly parallel.
         let [a, b, c] = twin.conic;
         let determinant = a * c - b * b;
         let bare = [c / determinant - BLUR, a / determinant - BLUR].map(f64::sqrt);
@@ -106,7 +106,7 @@ fn compare(
 }
 
 #[test]
-fn splats_of_hard_scenes_are_those_of_the_twin() {
+fn splats_of_hard_scenes_match_the_twin() {
     let Some(gpu) = device() else { return };
     for scene in hard_scenes(101, 1000, 3) {
         let (compared, close) = check(&View::render(&gpu, &scene));
@@ -116,9 +116,9 @@ fn splats_of_hard_scenes_are_those_of_the_twin() {
 }
 
 #[test]
-fn the_filter_of_mip_splatting_makes_splats_as_faint_as_the_twin_does() {
+fn splats_under_the_mip_filter_match_the_twin() {
     let Some(gpu) = device() else { return };
-    // A corner of a picture around which there is much that only its smoothing brings into sight.
+    // The corner of a larger picture. Only their smoothing makes many of the Gaussians around it visible.
     let mut corner = Scene::new("corner", samples::random(106, 2000, 0), 25, 17);
     corner.model.log_scales.fill([-2.5; 3]);
     corner.model.opacity_logits.fill(4.0);
@@ -150,7 +150,7 @@ fn every_degree_of_every_model_has_the_colours_of_the_twin() {
 }
 
 #[test]
-fn cameras_far_off_their_centre_see_what_the_twin_sees() {
+fn far_off_centre_cameras_see_the_same_as_the_twin() {
     let Some(gpu) = device() else { return };
     // Principal points outside the picture, long and short lenses, thin pictures.
     for (width, height, cx, cy, focal) in [
@@ -172,7 +172,7 @@ fn a_camera_among_the_gaussians_sees_those_in_front() {
     let Some(gpu) = device() else { return };
     let mut scene = Scene::new("inside", samples::random(104, 600, 1), 75, 53);
     (scene.camera, scene.pose) = samples::off_centre_view(75, 53, 0.1);
-    // Far from NEAR: what is closer than a tenth has splats of any size and condition.
+    // Keep away from NEAR: closer than 0.1, splats have any size and condition number.
     let keep = |mean: &[f32; 3]| scene.pose.transform(mean.map(f64::from).into()).z.abs() > 0.1;
     let (model, _) = scene.model.split_by(|mean| keep(&mean));
     let behind =

@@ -20,10 +20,10 @@ fn norm(v: &Gaussians64, index: usize, from: usize, to: usize) -> f64 {
     (from..to).map(|p| v.parameter(index, p).powi(2)).sum::<f64>().sqrt()
 }
 
-/// Compares by Gaussian and kind: the difference as a vector against the length of the gradient.
+/// Compares by Gaussian and kind: the length of the difference against the length of the gradient.
 ///
-/// `share` is for a splat of condition 1. The inverse of the covariance loses digits with its condition
-/// number, and a gradient goes through it twice.
+/// `share` holds for a condition number of 1. The inverse of the covariance loses digits with its condition
+/// number, and a gradient passes through it twice.
 #[track_caller]
 fn check(view: &View, share: f64) -> usize {
     let scene = &view.scene;
@@ -58,15 +58,14 @@ fn check(view: &View, share: f64) -> usize {
                 .map(|p| (kernel.parameter(index, p) - twin.parameter(index, p)).powi(2))
                 .sum::<f64>()
                 .sqrt();
-            // Measured against what a gradient is made of: sums over slots that may cancel.
+            // The tolerance is relative to the parts of the gradient: sums over slots, which may cancel.
             let size = &sizes[index];
             let mut shape = (size[2] + size[3] + size[4]) * (a + c) * condition.sqrt();
             if scene.mip_filter {
-                // Opacity falls with the area without the low-pass, from two vectors that may be nearly
-                // parallel.
+                // Opacity depends on the area without the low-pass, whose two vectors may be nearly parallel.
                 shape += size[5] * condition.sqrt();
             }
-            let made_of = length
+            let parts = length
                 + match kind {
                     "mean" => {
                         let per_unit = scene.camera.fx / splat.depth;
@@ -76,7 +75,7 @@ fn check(view: &View, share: f64) -> usize {
                     "opacity" => 0.25 * size[5],
                     _ => size[8] + size[9] + size[10],
                 };
-            let tolerance = share * condition.sqrt() * made_of + 1e-12;
+            let tolerance = share * condition.sqrt() * parts + 1e-12;
             assert!(
                 difference <= tolerance,
                 "{}: {kind} of Gaussian {index}: difference {difference:e} of {length:e}, tolerance {tolerance:e}, condition {condition:.0}",
@@ -88,7 +87,7 @@ fn check(view: &View, share: f64) -> usize {
     compared
 }
 
-/// From the gradient by a smoothed Gaussian to that by the bare one: w = ln sqrt(s^2 + d^2), o' = o times the
+/// From the gradient of a smoothed Gaussian to that of the bare one: w = ln sqrt(s^2 + d^2), o' = o times the
 /// product of s / sqrt(s^2 + d^2).
 fn through_smoothing(bare: &Gaussians64, smooth: &Gaussians64, index: usize, v: &mut Gaussians64) {
     let opacity = |logit: f64| 1.0 / (1.0 + (-logit).exp());
@@ -102,7 +101,7 @@ fn through_smoothing(bare: &Gaussians64, smooth: &Gaussians64, index: usize, v: 
 }
 
 #[test]
-fn parameter_gradients_of_hard_scenes_are_those_of_the_twin() {
+fn parameter_gradients_of_hard_scenes_match_the_twin() {
     let Some(gpu) = device() else { return };
     for scene in hard_scenes(122, 400, 3) {
         let compared = check(&View::render(&gpu, &scene), 2e-5);
@@ -111,7 +110,7 @@ fn parameter_gradients_of_hard_scenes_are_those_of_the_twin() {
 }
 
 #[test]
-fn parameter_gradients_through_the_filter_of_mip_splatting_are_those_of_the_twin() {
+fn parameter_gradients_through_the_mip_filter_match_the_twin() {
     let Some(gpu) = device() else { return };
     for scene in hard_scenes(125, 400, 1) {
         let compared = check(&View::render(&gpu, &scene.clone().filtered()), 2e-5);
@@ -135,7 +134,7 @@ fn every_degree_of_every_model_has_the_gradients_of_the_twin() {
 }
 
 #[test]
-fn the_whole_chain_in_f32_is_the_twin_to_a_thousandth() {
+fn the_whole_chain_in_f32_matches_the_twin_to_a_thousandth() {
     let Some(gpu) = device() else { return };
     let scene = Scene::new("chain", samples::random(124, 300, 2), 75, 53);
     let view = View::render(&gpu, &scene);
@@ -164,8 +163,8 @@ fn the_whole_chain_in_f32_is_the_twin_to_a_thousandth() {
                 .map(|p| (kernel.parameter(index, p) - twin.v_model.parameter(index, p)).powi(2))
                 .sum::<f64>();
         }
-        // A thousandth: one pixel more or less of a splat's rim, at 1/255, moves it by less; formulas that
-        // differ by more.
+        // One pixel more or less at the rim of a splat, at 1/255, changes less than a thousandth. A wrong
+        // formula changes more.
         let share = (difference / length).sqrt();
         assert!(length > 0.0 && share < 1e-3, "{kind}: the gradients differ by {share:e} of their length");
     }

@@ -1,4 +1,4 @@
-//! Colour, alpha and range of every pixel, from the kernels' own splats.
+//! Colour, alpha and range of every pixel, computed from the splats of the kernels.
 
 use fathom_twins::{RasterRules, intersect, rasterize_forward, samples};
 
@@ -6,7 +6,7 @@ use crate::bounds::of_images;
 use crate::device::layouts;
 use crate::view::{BACKGROUND, Scene, View, hard_scenes};
 
-/// Compares every pixel; gives how many lay at an edge.
+/// Compares every pixel and returns the number of edge pixels.
 #[track_caller]
 fn check(view: &View) -> usize {
     let (width, height) = (view.scene.camera.width, view.scene.camera.height);
@@ -42,19 +42,19 @@ fn check(view: &View) -> usize {
 }
 
 #[test]
-fn images_of_hard_scenes_are_those_of_the_twin() {
+fn images_of_hard_scenes_match_the_twin() {
     for gpu in layouts() {
         for scene in hard_scenes(51, 400, 1) {
             let edges = check(&View::render(&gpu, &scene));
-            // The band of alpha around 1/255 is some 1e-6 wide, for needles 1e-4: of 400 splats on 4,000
-            // pixels few are in it.
+            // The band of alpha around 1/255 is about 1e-6 wide, for needles 1e-4. Few of 400 splats on 4,000
+            // pixels lie in it.
             assert!(edges <= 4000 / 50, "{}: {edges} pixels at an edge", scene.name);
         }
     }
 }
 
 #[test]
-fn images_of_odd_sizes_are_those_of_the_twin() {
+fn images_of_odd_sizes_match_the_twin() {
     for gpu in layouts() {
         for (width, height) in [(1, 1), (16, 16), (17, 1), (1, 33), (8, 8), (9, 7), (128, 96), (75, 53)] {
             let scene = Scene::new(&format!("{width}x{height}"), samples::random(52, 150, 0), width, height);
@@ -82,7 +82,7 @@ fn tiles_without_splats_show_the_background() {
 #[test]
 fn a_view_of_nothing_is_the_background() {
     for gpu in layouts() {
-        // None at all, and none in front of the camera.
+        // No Gaussians at all, and none in front of the camera.
         let mut behind = samples::random(54, 20, 0);
         behind.means.iter_mut().for_each(|mean| mean[2] -= 50.0);
         let none = fathom_core::gaussians::Gaussians::empty(0);
@@ -98,13 +98,13 @@ fn a_view_of_nothing_is_the_background() {
 #[test]
 fn opaque_splats_end_rays_where_the_twin_ends_them() {
     for gpu in layouts() {
-        // Opacity 0.9999: the cap acts at the centres, and two layers end a ray.
+        // Opacity 0.9999: alpha is capped at the centres, and two layers end a ray.
         let mut model = samples::random(55, 600, 0);
         model.opacity_logits.fill(9.2);
         let view = View::render(&gpu, &Scene::new("opaque", model, 75, 53));
         check(&view);
         let ended = view.image().iter().filter(|pixel| pixel[3] > 0.99).count();
-        assert!(ended > 1000, "{ended} pixels are covered: the scene must reach the end of rays");
+        assert!(ended > 1000, "{ended} pixels are covered; more rays must end");
         let splats = view.splats();
         let lists = intersect(&splats, 75, 53);
         let twin = rasterize_forward(&splats, &lists, 75, 53, view.scene.background64(), &RasterRules::HARD);
@@ -114,7 +114,7 @@ fn opaque_splats_end_rays_where_the_twin_ends_them() {
             .read(&view.frame.targets().unwrap().tile_ends, 0, view.uniform.tile_count() as usize)
             .unwrap();
         let kernel_lists = view.tile_lists();
-        // The backward starts from tile_ends: no splat that the twin blended may lie behind it.
+        // The backward pass starts from tile_ends, so every splat that the twin blended must lie before it.
         for (i, &last) in twin.last.iter().enumerate().filter(|(_, last)| **last > 0) {
             let (x, y) = (i as u32 % 75, i as u32 / 75);
             let id = lists.of_tile(x / 16, y / 16)[last as usize - 1] as usize;

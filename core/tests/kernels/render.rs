@@ -1,4 +1,4 @@
-//! The renderer: strips and bands of a picture that is not rendered at once, and normals.
+//! The renderer: strips and bands of pictures that are not rendered in one piece, and normals.
 
 use std::sync::Arc;
 
@@ -10,8 +10,8 @@ use glam::{DQuat, DVec3};
 use crate::device::{assert_same_bits, layouts};
 use crate::view::hard_scenes;
 
-/// Discs of radius 0.15, a tenth of that thick, in a square of 9 x 9 around `centre`, 0.15 apart, half
-/// opaque, all turned by `rotation`, which takes +z to their normal.
+/// A square of 9 x 9 half-opaque discs around `centre`, 0.15 apart. Each has radius 0.15 and a tenth of that
+/// as thickness. `rotation` turns +z to their normal.
 fn wall(centre: DVec3, rotation: DQuat) -> Gaussians {
     let mut model = Gaussians::empty(1);
     for (row, column) in (-4..=4).flat_map(|row| (-4..=4).map(move |column| (row, column))) {
@@ -21,7 +21,7 @@ fn wall(centre: DVec3, rotation: DQuat) -> Gaussians {
         model.quats.push([q.w, q.x, q.y, q.z]);
         model.log_scales.push([0.15_f32.ln(), 0.15_f32.ln(), 0.015_f32.ln()]);
         model.opacity_logits.push(0.0);
-        // Higher harmonics must not reach the normals.
+        // Higher harmonics must not affect the normals.
         model.sh_coeffs.extend([[0.3, -0.2, 0.1], [5.0; 3], [-7.0; 3], [9.0; 3]]);
     }
     model
@@ -49,7 +49,7 @@ fn a_picture_in_strips_is_the_picture_in_one_piece() {
                 let of_range = (whole.range[pixel] - cut.range[pixel]).abs();
                 crossed += usize::from(of_range > 1e-3 * whole.range[pixel].max(1.0));
             }
-            // Rows are counted from the strip, so positions round otherwise and a few blends cross alpha =
+            // Rows are counted from the strip, so positions round differently and a few blends cross alpha =
             // 1/255.
             assert!(crossed < 5, "{}: {crossed} numbers of 3975 pixels differ", scene.name);
         }
@@ -57,7 +57,7 @@ fn a_picture_in_strips_is_the_picture_in_one_piece() {
 }
 
 #[test]
-fn a_picture_whose_lists_are_too_long_is_the_same_to_the_bit_in_bands() {
+fn a_picture_rendered_in_bands_is_the_same_to_the_bit() {
     for gpu in layouts() {
         for scene in hard_scenes(8, 300, 2) {
             let render = |limits: Option<ListLimits>| {
@@ -77,7 +77,7 @@ fn a_picture_whose_lists_are_too_long_is_the_same_to_the_bit_in_bands() {
 }
 
 #[test]
-fn normals_are_unit_in_the_cameras_frame_and_leave_the_colours_alone() {
+fn unit_normals_in_camera_axes_leave_the_colours_unchanged() {
     let camera = PinholeCamera { width: 75, height: 53, fx: 80.0, fy: 80.0, cx: 37.5, cy: 26.5 };
     let eye = DVec3::new(1.0, -2.0, 0.5);
     let pose = Pose::looking_at(eye, eye + DVec3::new(0.3, 0.2, 1.0), DVec3::Y);
@@ -100,7 +100,7 @@ fn normals_are_unit_in_the_cameras_frame_and_leave_the_colours_alone() {
                     continue;
                 }
                 walled += 1;
-                // All Gaussians have one normal, so blending leaves nothing but the rounding of f32 sums.
+                // All Gaussians have the same normal, so blending only adds the rounding of f32 sums.
                 let apart = DVec3::from(normal.map(f64::from)).distance(expected);
                 assert!(apart < 1e-3, "{degrees} degrees: {normal:?}, expected {expected}, alpha {alpha}");
             }

@@ -5,11 +5,11 @@ use fathom_core::rng::{Stream, random_bits};
 
 use crate::device::{device, layouts, poison, storage};
 
-/// Runs the three steps on `values`; gives the sums before each and the total.
+/// Runs the three steps on `values`; returns the sum before each value, and the total.
 fn scan(gpu: &Gpu, values: &[u32]) -> (Vec<u32>, u32) {
     let n = values.len() as u32;
     let chunks = n.div_ceil(1024);
-    // Any counter will do; this one shows that the slot is honoured.
+    // Any counter works; a slot other than 0 shows that the slot is respected.
     let which = gpu.uniform("which", &[counter::VISIBLE, 0, 0, 0]);
     let mut counts = [0xDEAD_u32; counter::COUNT as usize];
     counts[counter::VISIBLE as usize] = n;
@@ -26,7 +26,7 @@ fn scan(gpu: &Gpu, values: &[u32]) -> (Vec<u32>, u32) {
     recorder.dispatch("scan_apply", size, &[which, counters, values_at, sums_at]).unwrap();
     recorder.submit();
     let mut scanned: Vec<u32> = gpu.read(&buffer, 0, values.len() + 1).unwrap();
-    assert_eq!(scanned.pop(), Some(0xDEAD_BEEF), "{n} values: nothing behind the last is touched");
+    assert_eq!(scanned.pop(), Some(0xDEAD_BEEF), "{n} values: the word behind the last must not be touched");
     let total = gpu.read::<u32>(&sums, u64::from(chunks) * 4, 1).unwrap()[0];
     (scanned, total)
 }
@@ -34,7 +34,8 @@ fn scan(gpu: &Gpu, values: &[u32]) -> (Vec<u32>, u32) {
 #[test]
 fn a_scan_of_any_length_is_the_running_sum() {
     for gpu in layouts() {
-        // Around a thread's 16, a chunk's 1024, the spine's 64 chunks, and a spine of many rounds.
+        // Sizes around the 16 values of a thread, the 1024 of a chunk, the 64 chunks of the spine, and a
+        // spine of many rounds.
         for n in [0, 1, 15, 16, 17, 63, 1023, 1024, 1025, 65_535, 65_536, 65_537, 1_000_003] {
             let values: Vec<u32> = (0..n).map(|i| random_bits(1, Stream::Test, i, n)[0] % 1000).collect();
             let mut total = 0;
@@ -54,9 +55,9 @@ fn a_scan_of_any_length_is_the_running_sum() {
     }
 }
 
-/// What `count_visible` makes of a total: (groups in x, y, z) of slot `slot`.
+/// Arguments (groups in x, y, z) that `count_visible` writes to `slot` for a total.
 fn arguments(gpu: &Gpu, visible: u32, slot: u32) -> [u32; 3] {
-    // One Gaussian in all: its scan has one chunk, so the total stands in sums[1].
+    // With one Gaussian, the scan has one chunk, so the total is in sums[1].
     let view =
         FrameUniform { visible_capacity: u32::MAX, gaussians: 1, blocks: 1, ..FrameUniform::default() };
     let frame = gpu.uniform("frame", &view);
@@ -79,13 +80,13 @@ fn arguments(gpu: &Gpu, visible: u32, slot: u32) -> [u32; 3] {
     let found = gpu.read::<[u32; 3]>(&args, u64::from(slot) * 12, 1).unwrap()[0];
     let block = gpu.read::<[u32; 3]>(&args, u64::from(counter::ARGS_BLOCK) * 12, 1).unwrap()[0];
     if slot == counter::ARGS_VISIBLE {
-        assert_eq!(found, block, "the only block holds every visible Gaussian");
+        assert_eq!(found, block, "the only block must hold every visible Gaussian");
     }
     found
 }
 
 #[test]
-fn indirect_sizes_cover_every_count_within_the_limits_of_a_dispatch() {
+fn indirect_sizes_cover_every_count_within_dispatch_limits() {
     let Some(gpu) = device() else { return };
     let edge = 64 * 65_535;
     for visible in [0, 1, 64, 65, 64 * 32_768, 64 * 32_768 + 1, edge, edge + 1, 128 << 20] {
@@ -95,7 +96,7 @@ fn indirect_sizes_cover_every_count_within_the_limits_of_a_dispatch() {
             let groups = u64::from(x) * u64::from(y) * u64::from(z);
             assert!(x <= 65_535 && y <= 65_535, "{visible} visible: {x} x {y} groups");
             assert!(groups >= needed, "{visible} visible: {groups} groups for {needed}");
-            // Less than one row more: no work for nothing.
+            // Less than one extra row of groups.
             assert!(groups < needed + 32_768, "{visible} visible: {groups} groups for {needed}");
             assert_eq!(groups == 0, visible == 0, "{visible} visible");
         }
@@ -105,7 +106,7 @@ fn indirect_sizes_cover_every_count_within_the_limits_of_a_dispatch() {
 #[test]
 fn a_dispatch_beyond_65535_groups_reaches_every_item() {
     let Some(gpu) = device() else { return };
-    // 64 items a group: 78,126 groups, by the host's fold and by the device's.
+    // 64 items per group make 78,126 groups, folded by the host and by the device.
     let n = 5_000_001_u32;
     let tile = |i: u32| i / 1_000_000;
     let keys: Vec<u32> = (0..n).map(tile).collect();

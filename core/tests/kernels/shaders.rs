@@ -1,4 +1,4 @@
-//! The shaders as text: their layouts are those of the host, their table is complete. No adapter needed.
+//! The shaders as text: their layouts match the host, and their table is complete. No adapter needed.
 
 use std::mem::offset_of;
 
@@ -21,8 +21,8 @@ fn compare(stage: &str, name: &str, size: usize, fields: &[(&str, usize)]) {
     let Some((members, span)) = found else { panic!("{stage} has no struct {name}") };
     let in_wgsl: Vec<(&str, usize)> =
         members.iter().map(|m| (m.name.as_deref().unwrap_or("?"), m.offset as usize)).collect();
-    assert_eq!(in_wgsl, fields, "{name}: WGSL (left) and the host's mirror");
-    assert_eq!(span as usize, size, "{name}: size in WGSL and of the host's mirror");
+    assert_eq!(in_wgsl, fields, "{name}: fields in WGSL (left) and in the host's mirror");
+    assert_eq!(span as usize, size, "{name}: size in WGSL (left) and of the host's mirror");
 }
 
 macro_rules! mirror {

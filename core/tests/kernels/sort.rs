@@ -5,7 +5,7 @@ use fathom_core::rng::{Stream, random_bits};
 
 use crate::device::{layouts, poison, storage};
 
-/// Sorts by the lower `bits` of the keys, six a pass, as a frame does.
+/// Sorts by the lower `bits` of the keys, six bits per pass, as a frame does.
 fn sort(gpu: &Gpu, keys: &[u32], values: &[u32], bits: u32) -> (Vec<u32>, Vec<u32>) {
     let n = keys.len() as u32;
     let chunks = n.div_ceil(2048);
@@ -67,8 +67,8 @@ fn check(gpu: &Gpu, what: &str, keys: &[u32], bits: u32) {
 #[test]
 fn a_sort_of_any_length_is_the_stable_sort() {
     for gpu in layouts() {
-        // Around a thread's 64 keys, a workgroup's 2048, and where the histogram (32 keys a count) needs a
-        // second scan chunk.
+        // Sizes around the 64 keys of a thread, the 2048 of a workgroup, and the size where the histogram (32
+        // keys per count) needs a second scan chunk.
         for n in [0, 1, 2, 63, 64, 65, 1023, 1024, 1025, 2047, 2048, 2049, 32_767, 32_768, 32_769, 200_001] {
             let keys: Vec<u32> = (0..n).map(|i| random_bits(2, Stream::Test, i, n)[0] >> 2).collect();
             check(&gpu, "random", &keys, 30);

@@ -17,14 +17,14 @@ use glam::DVec3;
 
 use crate::device::{assert_same_bits, device, layouts};
 
-/// What is photographed: few large splats.
+/// The photographed model: few large splats.
 pub fn truth() -> Gaussians {
     let mut model = random(91, 60, 0);
     model.log_scales.iter_mut().for_each(|scales| *scales = scales.map(|s| s.max(-2.8)));
     model
 }
 
-/// Six photographs from around, of `width` x `height`.
+/// Six photographs from different directions, of `width` x `height`.
 pub fn photographs(gpu: &Arc<Gpu>, width: u32, height: u32) -> InMemory {
     photographs_of(gpu, &truth(), width, height)
 }
@@ -56,7 +56,7 @@ pub fn photographs_from(
     InMemory { views, images }
 }
 
-/// The truth, moved, faded and grey: where training starts.
+/// The start of training: the true model moved, faded and grey.
 fn start() -> Gaussians {
     let mut model = truth();
     for (i, mean) in model.means.iter_mut().enumerate() {
@@ -69,7 +69,7 @@ fn start() -> Gaussians {
     grey(&model)
 }
 
-/// The same without turns and colours, at SH 1.
+/// The same without rotations and colours, at SH 1.
 pub fn grey(model: &Gaussians) -> Gaussians {
     let mut full = Gaussians::empty(1);
     for i in 0..model.len() {
@@ -91,20 +91,21 @@ pub fn config(iterations: u32) -> TrainConfig {
         means_lr: 1e-3,
         means_lr_end: 1e-4,
         sh_dc_lr: 2e-2,
-        // The default is for splats of a few pixels; these are a quarter of a picture.
+        // The default suits splats of a few pixels; these cover a quarter of a picture.
         scales_lr: 1e-2,
         mean_noise: 5e3,
         ..TrainConfig::default()
     }
 }
 
-/// Classic density control that adds and removes in runs as short as these; of 40 iterations it refines at 7,
-/// 14, 21 and 28 and resets at 10, 20 and 30.
+/// Classic density control that adds and removes Gaussians in such short runs. In 40 iterations it densifies
+/// at 7, 14, 21 and 28 and resets at 10, 20 and 30.
 fn classic(iterations: u32) -> TrainConfig {
     TrainConfig {
         strategy: Strategy::Classic,
         classic: ClassicConfig {
-            // A quarter is cloned or split; who rises after a reset is kept, who does not is removed.
+            // A quarter is cloned or split. Gaussians whose opacity rises after a reset stay; the others are
+            // removed.
             gradient: 1.5e-2,
             prune_opacity: 0.0102,
             reset_every: 0.25,
@@ -127,9 +128,9 @@ pub fn run(photographs: &InMemory, config: TrainConfig) -> TrainRun {
     }
 }
 
-/// Runs `new` to its end and again: interrupted at each of `interruptions` and resumed in another trainer,
-/// with lists that must grow, and in bands of tiles, which `limits` must make necessary. Every run must give
-/// the same model and the same of what `learnt` says besides. Returns both.
+/// Runs `new` to its end, then repeats it: interrupted at each of `interruptions` and resumed in another
+/// trainer, with lists that must grow, and in bands of tiles. `limits` must be small enough to require bands.
+/// Every run must give the same model and the same result of `learnt`. Returns both.
 pub fn same_however_it_runs<T: PartialEq>(
     gpu: &Arc<Gpu>,
     what: &str,
@@ -151,16 +152,16 @@ pub fn same_however_it_runs<T: PartialEq>(
         let (other_model, other, most_bands) = finish(trainer);
         assert_eq!(most_bands > 1, bands, "{what}: bands");
         assert_same_model(&what, &model, &other_model);
-        assert!(other == expected, "{what}: what was learnt besides");
+        assert!(other == expected, "{what}: the result of `learnt`");
     };
     check("again", start(), false);
     for at in interruptions {
         let mut first = start();
         first.advance(at).unwrap();
         let checkpoint = first.checkpoint().unwrap();
-        assert!(first.checkpoint().unwrap() == checkpoint, "{what}: a checkpoint at {at} changed something");
+        assert!(first.checkpoint().unwrap() == checkpoint, "{what}: a checkpoint at {at} changed the state");
         let mut second = Trainer::resume(Arc::clone(gpu), new(), &checkpoint).unwrap();
-        assert!(second.checkpoint().unwrap() == checkpoint, "{what}: resumed at {at} it has another state");
+        assert!(second.checkpoint().unwrap() == checkpoint, "{what}: resuming at {at} gave another state");
         check(&format!("resumed at {at}"), second, false);
         check(&format!("after a checkpoint at {at}"), first, false);
     }
@@ -173,7 +174,7 @@ pub fn same_however_it_runs<T: PartialEq>(
     (model, expected)
 }
 
-/// Lists so short that a view of [`photographs`] takes several bands.
+/// Lists so short that a view of [`photographs`] needs several bands.
 pub const BANDED: ListLimits = ListLimits { visible: 70, intersections: 400 };
 
 #[track_caller]
@@ -219,13 +220,13 @@ fn training_lowers_the_loss_and_raises_the_psnr() {
         last.loss
     );
     assert!(after > before + 8.0, "PSNR {before:.2} dB at the start, {after:.2} dB at the end");
-    // The cap is reached and never passed.
+    // The cap is reached and never exceeded.
     assert_eq!((most, last.gaussians), (100, 100));
-    assert_eq!(trainer.advance(10).unwrap(), last, "a run that is over does nothing");
+    assert_eq!(trainer.advance(10).unwrap(), last, "a finished run must do nothing");
 }
 
 #[test]
-fn classic_density_control_lowers_the_loss_under_the_cap_and_removes_what_faded() {
+fn classic_density_control_lowers_the_loss_and_keeps_the_cap() {
     let Some(gpu) = device() else { return };
     let photographs = photographs(&gpu, 64, 48);
     let config = TrainConfig {
@@ -249,16 +250,16 @@ fn classic_density_control_lowers_the_loss_under_the_cap_and_removes_what_faded(
         last.loss
     );
     assert!(after > before + 6.0, "PSNR {before:.2} dB at the start, {after:.2} dB at the end");
-    assert_eq!(counts.iter().max(), Some(&80), "the cap is reached and never passed: {counts:?}");
-    assert!(!counts.is_sorted(), "some are removed: {counts:?}");
+    assert_eq!(counts.iter().max(), Some(&80), "the cap must be reached and never exceeded: {counts:?}");
+    assert!(!counts.is_sorted(), "some Gaussians must be removed: {counts:?}");
     assert!(
         counts[20..].iter().all(|count| count == &last.gaussians),
-        "nothing happens after its end: {counts:?}"
+        "density control must stop at its end: {counts:?}"
     );
 }
 
 #[test]
-fn a_model_trained_with_the_filter_of_mip_splatting_is_best_rendered_with_it() {
+fn a_model_trained_with_the_mip_filter_renders_best_with_it() {
     let Some(gpu) = device() else { return };
     let photographs = photographs(&gpu, 64, 48);
     let config = TrainConfig { mip_filter: true, ..config(240) };
@@ -271,7 +272,7 @@ fn a_model_trained_with_the_filter_of_mip_splatting_is_best_rendered_with_it() {
         with > before + 8.0 && with > without + 0.5,
         "{before:.2}, without {without:.2}, with {with:.2} dB"
     );
-    // What is handed out is as wide as its smoothing: at least the root of a fifth of a pixel at the nearest
+    // The returned model includes its smoothing. Its scales are at least sqrt(0.2) pixel at the nearest
     // depth.
     let camera = photographs.views[0].camera;
     let finest = 0.2_f64.sqrt() / camera.fx.max(camera.fy);
@@ -282,7 +283,7 @@ fn a_model_trained_with_the_filter_of_mip_splatting_is_best_rendered_with_it() {
         let nearest =
             photographs.views.iter().map(|view| view.pose.transform(model.means[i].map(f64::from).into()).z);
         let depth = nearest.fold(f64::MAX, f64::min);
-        // Four fifths: it has moved since the widths were found.
+        // 0.8, because the Gaussian has moved since the widths were computed.
         let bound = 0.8 * finest * depth;
         assert!(f64::from(least).exp() > bound, "Gaussian {i}: {}, bound {bound}", least.exp());
         widened += usize::from(scales.iter().zip(was).all(|(a, b)| a > b));
@@ -311,7 +312,7 @@ fn a_seed_decides_every_byte() {
 }
 
 #[test]
-fn a_photograph_that_cannot_be_read_once_loses_and_repeats_no_step() {
+fn a_failed_photograph_read_loses_and_repeats_no_step() {
     struct Flaky {
         photographs: InMemory,
         loads: AtomicU32,
@@ -322,9 +323,9 @@ fn a_photograph_that_cannot_be_read_once_loses_and_repeats_no_step() {
         }
 
         fn load(&self, index: usize) -> fathom_core::Result<Arc<PackedImage>> {
-            // Each of six views is read once: this is the fifth iteration.
+            // Each of six views is read once, so this fails in the fifth iteration.
             if self.loads.fetch_add(1, Ordering::Relaxed) == 4 {
-                return Err(CoreError::Scene("the disk was away".into()));
+                return Err(CoreError::Scene("the disk was gone".into()));
             }
             self.photographs.load(index)
         }
@@ -338,7 +339,7 @@ fn a_photograph_that_cannot_be_read_once_loses_and_repeats_no_step() {
     let mut flaky =
         Trainer::new(Arc::clone(&gpu), TrainRun { views, ..run(&photographs, config()) }).unwrap();
     let error = flaky.advance(40).unwrap_err();
-    assert!(error.to_string().contains("the disk was away"), "{error}");
+    assert!(error.to_string().contains("the disk was gone"), "{error}");
     assert_eq!(flaky.progress().iteration, 4);
     assert_eq!(flaky.advance(40).unwrap().iteration, 40);
     assert_same_model("after a photograph", &plain.gaussians().unwrap(), &flaky.gaussians().unwrap());
@@ -347,7 +348,7 @@ fn a_photograph_that_cannot_be_read_once_loses_and_repeats_no_step() {
 #[test]
 fn threads_that_read_ahead_change_no_byte() {
     let Some(gpu) = device() else { return };
-    // 192 pixels: two sizes of each photograph.
+    // 192 pixels: each photograph has two sizes.
     let photographs = photographs(&gpu, 192, 20);
     let train = |prefetch_threads: u32| {
         let config = TrainConfig { prefetch_threads, ..config(30) };
@@ -364,25 +365,25 @@ fn threads_that_read_ahead_change_no_byte() {
 #[test]
 fn a_resumed_run_gives_the_bytes_of_an_uninterrupted_one() {
     let Some(gpu) = device() else { return };
-    // 192 pixels: large enough to begin at half size, so a resumed run must find its level too.
+    // 192 pixels are enough to start at half size, so a resumed run must also find its level.
     let photographs = photographs(&gpu, 192, 20);
     for config in [config(40), classic(40), TrainConfig { mip_filter: true, ..classic(40) }] {
         let new = || Trainer::new(Arc::clone(&gpu), run(&photographs, config.clone())).unwrap();
         let mut whole = new();
         whole.advance(40).unwrap();
         let whole = whole.gaussians().unwrap();
-        // 0: before the first step; 34: after the last refinement; others between, before and at refinements
-        // (every 7) and resets (every 10).
+        // 0: before the first step; 34: after the last density control; the others are between, before and at
+        // density control (every 7) and resets (every 10).
         for at in [0, 1, 6, 7, 10, 13, 19, 20, 21, 34] {
             let mut first = new();
             first.advance(at).unwrap();
             let checkpoint = first.checkpoint().unwrap();
-            assert_eq!(first.checkpoint().unwrap(), checkpoint, "a checkpoint changes nothing");
+            assert_eq!(first.checkpoint().unwrap(), checkpoint, "a checkpoint must change nothing");
             drop(first);
             let mut second =
                 Trainer::resume(Arc::clone(&gpu), run(&photographs, config.clone()), &checkpoint).unwrap();
             assert_eq!(second.progress().iteration, at);
-            assert_eq!(second.checkpoint().unwrap(), checkpoint, "checkpoint of what was resumed at {at}");
+            assert_eq!(second.checkpoint().unwrap(), checkpoint, "checkpoint of the run resumed at {at}");
             second.advance(40).unwrap();
             let what = format!("{:?}, resumed at {at}", config.strategy);
             assert_same_model(&what, &whole, &second.gaussians().unwrap());
@@ -431,7 +432,7 @@ fn bands_change_no_byte() {
             };
             let (whole, loss, bands, _) = train(None);
             assert_eq!(bands, 1);
-            // Too few of either kind of entry, and of both.
+            // Too few entries of either kind, and of both.
             for (visible, intersections) in [(130, 100_000), (100_000, 400), (130, 400)] {
                 let limits = ListLimits { visible, intersections };
                 let (model, banded_loss, bands, capacities) = train(Some(limits));
@@ -445,7 +446,7 @@ fn bands_change_no_byte() {
 }
 
 #[test]
-fn a_tile_that_sees_more_than_a_list_holds_is_an_error_that_says_what_to_do() {
+fn a_tile_beyond_the_list_limit_is_an_error_with_advice() {
     let Some(gpu) = device() else { return };
     let photographs = photographs(&gpu, 32, 24);
     let mut trainer = Trainer::new(Arc::clone(&gpu), run(&photographs, config(10))).unwrap();
@@ -466,7 +467,7 @@ fn a_torn_or_foreign_checkpoint_is_refused() {
         |what: &str, run: TrainRun, bytes: &[u8]| match Trainer::resume(Arc::clone(&gpu), run, bytes) {
             Err(CoreError::Checkpoint(_)) => {}
             Err(other) => panic!("{what}: {other}"),
-            Ok(_) => panic!("{what}: was taken"),
+            Ok(_) => panic!("{what}: was accepted"),
         };
     let own = || run(&photographs, config(20));
     for length in [0, 7, 8, 60, 87, 88, whole.len() / 2, whole.len() - 1] {
@@ -486,8 +487,7 @@ fn a_torn_or_foreign_checkpoint_is_refused() {
     let mut context = own();
     context.context.push_from(&start(), 0);
     refused("another context", context, &whole);
-    // What was made of one with the right digest and does not hold what it says; the run is then where it
-    // was.
+    // Checkpoints with a correct digest and wrong content. A refused checkpoint leaves the run unchanged.
     let sealed = |content: &[u8]| [content, blake3::hash(content).as_bytes()].concat();
     let content = &whole[..whole.len() - 32];
     let mut fewer = content.to_vec();
@@ -504,7 +504,7 @@ fn a_torn_or_foreign_checkpoint_is_refused() {
         assert!(matches!(trainer.go_to(&bytes), Err(CoreError::Checkpoint(_))), "{what}");
         assert_same_bits(what, &whole, &trainer.checkpoint().unwrap());
     }
-    // How often checkpoints are made and who reads photographs is no part of the run.
+    // The interval of checkpoints and the number of reading threads do not belong to the run.
     let other = TrainConfig { checkpoint_seconds: 1, prefetch_threads: 2, ..config(20) };
     assert!(Trainer::resume(Arc::clone(&gpu), run(&photographs, other), &whole).is_ok());
 }
@@ -529,11 +529,15 @@ fn context_is_seen_but_never_changes() {
     assert_eq!(before[0].len(), 12 * context.len());
     trainer.advance(30).unwrap();
     assert_eq!(before, bits(&trainer));
-    // `focus` grew; only focus comes back.
+    // `focus` grew; only its Gaussians are returned.
     assert_eq!(trainer.gaussians().unwrap().len(), 100);
     let mut alone = Trainer::new(Arc::clone(&gpu), without).unwrap();
     alone.advance(30).unwrap();
-    assert_ne!(alone.gaussians().unwrap().means, trainer.gaussians().unwrap().means, "context is seen");
+    assert_ne!(
+        alone.gaussians().unwrap().means,
+        trainer.gaussians().unwrap().means,
+        "the context must be visible"
+    );
 }
 
 #[test]
@@ -558,7 +562,7 @@ fn masked_pixels_do_not_influence_training() {
     };
     let (black, pink) = (paint(0), paint(0x00FF_20FF));
     assert_same_model("another colour under the mask", &black, &pink);
-    assert_ne!(black.means, unmasked.means, "the mask hides something");
+    assert_ne!(black.means, unmasked.means, "the mask must hide something");
 }
 
 #[test]

@@ -1,4 +1,4 @@
-//! One view of one model through the kernels, and what each stage left.
+//! One view of one model through the kernels, with the output of each stage.
 
 use std::sync::Arc;
 
@@ -15,7 +15,7 @@ use fathom_twins::{Gaussians64, RasterGradients, RasterRules, Splat, SplatGradie
 
 pub const BACKGROUND: [f32; 3] = [0.2, 0.7, 0.4];
 
-/// What is rendered from where.
+/// A model and the camera that renders it.
 #[derive(Clone)]
 pub struct Scene {
     pub name: String,
@@ -48,7 +48,7 @@ impl Scene {
         self
     }
 
-    /// What the kernels do with it.
+    /// The blending rules that the kernels apply to it.
     pub fn rules(&self) -> RasterRules {
         RasterRules { mip_filter: self.mip_filter, ..RasterRules::HARD }
     }
@@ -81,8 +81,8 @@ pub struct View {
 }
 
 impl View {
-    /// All of the model in one trainable block, rendered. Moments are in f32, where raw gradients can be
-    /// kept.
+    /// Renders the whole model in one trainable block. Its moments are f32, because raw gradients can be
+    /// stored there.
     pub fn render(gpu: &Arc<Gpu>, scene: &Scene) -> Self {
         Self::render_with(gpu, scene, Moments::F32)
     }
@@ -116,19 +116,19 @@ impl View {
         self.blocks.trainable().flat_map(of_block).collect()
     }
 
-    /// The model with its smoothing: what a twin draws.
+    /// The model with its smoothing applied, as a twin draws it.
     pub fn drawn(&self) -> Gaussians64 {
         Gaussians64::from(&smoothed(self.scene.model.clone(), &self.smoothing()))
     }
 
-    /// The same with the model in blocks that the caller made.
+    /// The same with blocks that the caller made.
     pub fn render_blocks(gpu: &Arc<Gpu>, scene: &Scene, blocks: Blocks) -> Self {
         let mut view = Self::prepare(gpu, scene, blocks);
         view.forward();
         view
     }
 
-    /// Buffers only, with room for every splat in every tile.
+    /// Makes the buffers without rendering, with room for every splat in every tile.
     pub fn prepare(gpu: &Arc<Gpu>, scene: &Scene, blocks: Blocks) -> Self {
         let tile = gpu.tile();
         let tiles = scene.camera.width.div_ceil(tile) * scene.camera.height.div_ceil(tile);
@@ -136,7 +136,7 @@ impl View {
         Self::prepare_lists(gpu, scene, blocks, intersections)
     }
 
-    /// The same with room for so many intersections.
+    /// The same with room for `intersections` intersections.
     pub fn prepare_lists(gpu: &Arc<Gpu>, scene: &Scene, blocks: Blocks, intersections: u32) -> Self {
         let n = blocks.total();
         let uniform = FrameUniform {
@@ -154,7 +154,12 @@ impl View {
         let mut recorder = Recorder::new(&self.gpu);
         self.frame.record_forward(&self.gpu, &mut recorder, &self.blocks, &self.uniform).unwrap();
         recorder.submit();
-        assert_eq!(self.frame.overflow(&self.gpu).unwrap(), None, "{}: the lists are ample", self.scene.name);
+        assert_eq!(
+            self.frame.overflow(&self.gpu).unwrap(),
+            None,
+            "{}: the lists must be large enough",
+            self.scene.name
+        );
     }
 
     pub fn pixels(&self) -> usize {
@@ -191,8 +196,8 @@ impl View {
         all
     }
 
-    /// The projected records by Gaussian; `None` where it is culled or touches nothing. Depth is not in the
-    /// records: it is that of the twin of the model.
+    /// The projected records by Gaussian; `None` where it is culled or touches no tile. The records have no
+    /// depth, so depth comes from the twin.
     pub fn splats(&self) -> Vec<Option<Splat>> {
         let visible = self.visible();
         let records: Vec<[f32; 12]> = self.gpu.read(&self.frame.projected, 0, visible.len()).unwrap();
@@ -221,7 +226,7 @@ impl View {
         splats
     }
 
-    /// Gaussians of each tile in the order in which they are blended.
+    /// Gaussians of each tile in blending order.
     pub fn tile_lists(&self) -> Vec<Vec<usize>> {
         let visible = self.visible();
         let tiles = self.uniform.tile_count();
@@ -234,13 +239,13 @@ impl View {
         ranges.iter().map(|r| slots[r[0] as usize..r[1] as usize].iter().map(gaussian).collect()).collect()
     }
 
-    /// Runs the backward with these gradients of the images and gives the slots' gradients.
+    /// Runs the backward pass with these gradients of the images and returns the gradients of the slots.
     pub fn backward(&self, v: &ImageGradients, step: &StepUniform) -> Vec<[f32; 12]> {
         let slots = self.record_backward(v, step);
         self.gpu.read(&slots, 0, self.counter(counter::INTERSECTIONS)).unwrap()
     }
 
-    /// The same, leaving the gradients on the device. The buffer starts as rubbish.
+    /// The same, but the gradients stay on the device. The buffer starts filled with rubbish.
     pub fn record_backward(&self, v: &ImageGradients, step: &StepUniform) -> wgpu::Buffer {
         let gpu = &self.gpu;
         let v_image = super::device::storage(gpu, &v.image);
@@ -293,8 +298,8 @@ impl View {
         sums
     }
 
-    /// Sums of the absolute values of slots by Gaussian: what the sums of [`View::splat_gradients`] may have
-    /// cancelled from.
+    /// Sums of the absolute values of slots by Gaussian: the size of [`View::splat_gradients`] without
+    /// cancellation.
     pub fn slot_sizes(&self, slots: &[[f32; 12]]) -> Vec<[f64; 12]> {
         let visible = self.visible();
         let segments: Vec<[u32; 2]> = self.gpu.read(&self.frame.segments, 0, visible.len()).unwrap();
@@ -307,7 +312,8 @@ impl View {
         sizes
     }
 
-    /// Gradients of all parameters after a backward with `gradients_only`; zeros where nothing was written.
+    /// Gradients of all parameters after a backward pass with `gradients_only`; zeros where nothing was
+    /// written.
     pub fn parameter_gradients(&self) -> Gaussians64 {
         let mut v = Gaussians64::zeros(self.blocks.trainable_total() as usize, self.scene.model.sh_degree);
         let (stride, coeffs) = (4 * sh_stride(self.scene.model.sh_degree) as usize, v.coeffs());
@@ -332,12 +338,12 @@ impl View {
     }
 }
 
-/// Asks for raw gradients in place of steps.
+/// Requests raw gradients instead of steps.
 pub fn gradients_only() -> StepUniform {
     StepUniform { gradients_only: 1, ..StepUniform::default() }
 }
 
-/// Gradients of a loss by the images, as the kernels take them.
+/// Gradients of a loss with respect to the images, in the layout of the kernels.
 #[derive(Clone)]
 pub struct ImageGradients {
     pub image: Vec<[f32; 4]>,
@@ -345,7 +351,7 @@ pub struct ImageGradients {
 }
 
 impl ImageGradients {
-    /// One number from -1 to 1 for each number of the images.
+    /// One random number from -1 to 1 for each number of the images.
     pub fn random(seed: u32, pixels: usize) -> Self {
         let u = |i, j| 2.0 * uniform_at(seed, Stream::Test, i, j) - 1.0;
         let pixels = 0..pixels as u32;

@@ -1,5 +1,4 @@
-//! Colours for viewers: what a model shows that is blended in linear light, shown by programs that blend in
-//! sRGB.
+//! Colours for viewers: they let programs that blend in sRGB show a model that is blended in linear light.
 
 use fathom_core::config::Composition;
 use fathom_core::gaussians::Gaussians;
@@ -12,7 +11,7 @@ use fathom_core::water::Water;
 use crate::device::device;
 use crate::trainer::{photographs, truth};
 
-/// What `model` shows from `view`: through a water, or as viewers show it.
+/// The picture of `model` from `view`: under `water`, or as viewers show it.
 fn picture(
     gpu: &std::sync::Arc<Gpu>,
     model: &Gaussians,
@@ -25,11 +24,11 @@ fn picture(
 }
 
 #[test]
-fn a_model_blended_in_linear_light_looks_the_same_in_viewers_with_other_colours_alone() {
+fn new_colours_alone_show_a_linear_model_in_srgb_viewers() {
     let Some(gpu) = device() else { return };
     let mut views = photographs(&gpu, 96, 72).views;
     let held_out = views.remove(2);
-    // Half transparent, so that colours lie over each other.
+    // Half transparent, so that colours overlap.
     let model = Gaussians { opacity_logits: vec![0.0; truth().len()], ..truth() };
     let water = Water { beta_d: [0.32, 0.11, 0.08], beta_b: [0.26, 0.14, 0.11], b_inf: [0.025, 0.11, 0.19] };
     let shown = WaterView {
@@ -40,17 +39,21 @@ fn a_model_blended_in_linear_light_looks_the_same_in_viewers_with_other_colours_
         output: Output::Restored,
     };
     let find = |iterations| {
-        let (mut told, views) = (Vec::new(), views.clone());
+        let (mut reported, views) = (Vec::new(), views.clone());
         let colours = ViewerColours { iterations, seed: 1 };
-        let found = colours.find(&gpu, &model, shown, views, |now| told.push(now.iteration)).unwrap();
-        (found, told)
+        let found = colours.find(&gpu, &model, shown, views, |now| reported.push(now.iteration)).unwrap();
+        (found, reported)
     };
-    let (found, told) = find(620);
-    assert_eq!((told.first(), told.last()), (Some(&50), Some(&620)));
-    assert_eq!(Gaussians { sh_coeffs: model.sh_coeffs.clone(), ..found.clone() }, model, "colours alone");
+    let (found, reported) = find(620);
+    assert_eq!((reported.first(), reported.last()), (Some(&50), Some(&620)));
+    assert_eq!(
+        Gaussians { sh_coeffs: model.sh_coeffs.clone(), ..found.clone() },
+        model,
+        "only colours may change"
+    );
     let own = picture(&gpu, &model, Some(shown), &held_out);
     let [before, after] = [&model, &found].map(|model| psnr(&picture(&gpu, model, None, &held_out), &own));
-    // What stays is at the edges of Gaussians over black, where no colour helps.
+    // The remaining difference is at the edges of Gaussians over black, which no colour can correct.
     assert!(after > before + 4.0, "from {before} to {after} dB");
-    assert_eq!(find(620).0, found, "the same seed gives the same bytes");
+    assert_eq!(find(620).0, found, "the same seed must give the same bytes");
 }

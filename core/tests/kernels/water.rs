@@ -1,4 +1,4 @@
-//! Water between Gaussians and camera: kernels against the twin, and what it does in a run.
+//! Water between Gaussians and camera: kernels against the twin, and its effect on a run.
 
 use std::sync::Arc;
 
@@ -36,12 +36,12 @@ pub fn medium_run(config: WaterConfig, water: Water) -> MediumRun {
     MediumRun { water, ..fixed(&config, 3.2) }
 }
 
-/// A run that starts from the numbers of `config`, and composes as it says.
+/// The medium of a run that starts from the parameters of `config` and uses its composition.
 pub fn fixed(config: &WaterConfig, unit: f64) -> MediumRun {
     MediumRun::fixed(config, config.composition().unwrap().unwrap(), unit)
 }
 
-pub const WAYS: [(Medium, Blend); 5] = [
+pub const COMPOSITIONS: [(Medium, Blend); 5] = [
     (Medium::PerGaussian, Blend::Srgb),
     (Medium::PerGaussian, Blend::Linear),
     (Medium::PerPixel, Blend::Linear),
@@ -53,21 +53,21 @@ pub fn with((medium, blend): (Medium, Blend)) -> WaterConfig {
     WaterConfig { medium, blend, ..WaterConfig::default() }
 }
 
-/// The gradients of the splats of a view that was rendered whole.
+/// The gradients of the splats of a view that was rendered in one piece.
 pub fn gradients_of<'a>(frame: &'a Frame, blocks: &'a Blocks, slots: &'a wgpu::Buffer) -> SplatGradients<'a> {
     SplatGradients { frame, blocks, slots, in_bands: false }
 }
 
-/// The nine sums over all rows of `partials`.
+/// Sums over all rows of `partials`, one per water parameter.
 pub fn sums(gpu: &Gpu, partials: &wgpu::Buffer) -> [f64; 9] {
     let rows: Vec<[[f32; 4]; 3]> = gpu.read(partials, 0, (partials.size() / 48) as usize).unwrap();
     std::array::from_fn(|i| rows.iter().map(|row| f64::from(row[i / 3][i % 3])).sum())
 }
 
 #[test]
-fn pictures_under_water_and_their_gradients_are_those_of_the_twin() {
+fn pictures_under_water_and_gradients_match_the_twin() {
     for gpu in layouts() {
-        for composed in WAYS {
+        for composed in COMPOSITIONS {
             for (k, (width, height)) in [(1, 1), (33, 31), (32, 32), (75, 53)].into_iter().enumerate() {
                 check_pictures(&gpu, composed, width, height, 300 + k as u32, None);
                 if composed.0 == Medium::PerPixel {
@@ -78,14 +78,15 @@ fn pictures_under_water_and_their_gradients_are_those_of_the_twin() {
     }
 }
 
-/// What changes by a few times within the picture, and stops at its limit in a corner.
+/// A water colour that changes by a factor of a few within the picture and reaches its limit in one corner.
 const BY_DIRECTION: ByDirection = ByDirection {
     middle: [0.0, 0.6, 0.8],
     slopes: [[0.3, -1.0, 0.0], [0.0, -2.0, 0.2], [1.5, -3.0, 0.0]],
     most: 1.4,
 };
 
-/// With `by_direction` the view also has a map of what its rays end on, which then tells in place of colours.
+/// With `by_direction`, the view also has a map of what its rays end on. The map then replaces the test by
+/// colour.
 fn check_pictures(
     gpu: &Arc<Gpu>,
     composed: (Medium, Blend),
@@ -97,7 +98,7 @@ fn check_pictures(
     let what = format!("{composed:?}, {width}x{height}");
     let pixels = width * height;
     let u = |i, j| uniform_at(seed, Stream::Test, i, j);
-    // Empty, thin, half and whole; a photograph that is open water in every third pixel.
+    // Empty, thin, partial and opaque pixels; every third pixel of the photograph is open water.
     let alpha = |i: u32| [0.0, 1e-4, u(i, 3), 1.0][(i % 4) as usize];
     let image: Vec<[f32; 4]> =
         (0..pixels).map(|i| [alpha(i) * u(i, 0), alpha(i) * u(i, 1), alpha(i) * u(i, 2), alpha(i)]).collect();
@@ -124,7 +125,7 @@ fn check_pictures(
     let (w, h) = (f64::from(width), f64::from(height));
     let camera = PinholeCamera { width, height, fx: w, fy: 0.9 * w, cx: 0.45 * w, cy: 0.6 * h };
     let pose = Pose::looking_at(DVec3::ZERO, DVec3::new(0.1, 0.5, 0.8), DVec3::Y);
-    // Unknown, surface, open, edge; a range in every other cell.
+    // Cells are unknown, surface, open water and edge in turn; every other cell has a range.
     let map_range = |cell: u32| if cell.is_multiple_of(2) { 4.0_f32 } else { 0.0 };
     let map: Vec<u32> = (0..15).map(|cell| (map_range(cell).to_bits() & !3) | (cell % 4)).collect();
     let cell_at = |i: u32| (i / width) * 3 / height * 5 + (i % width) * 5 / width;
@@ -161,9 +162,10 @@ fn check_pictures(
     let v_range: Vec<f32> = gpu.read(&v_range, 0, pixels as usize).unwrap();
 
     let mut v_water = [0.0; 9];
-    // Over black nothing tells open water from a scene.
-    let told = if composed.1 == Blend::OverBlack { 0.0 } else { 1.0 };
-    let [background, surface] = [0.3, 0.2].map(|weight: f32| told * f64::from(weight / pixels as f32));
+    // Over black, open water looks like the scene, so these terms are off.
+    let is_separable = if composed.1 == Blend::OverBlack { 0.0 } else { 1.0 };
+    let [background, surface] =
+        [0.3, 0.2].map(|weight: f32| is_separable * f64::from(weight / pixels as f32));
     for i in 0..pixels as usize {
         let [r, g, b, alpha] = image[i].map(f64::from);
         let pixel = Blended { rgb: [r, g, b], alpha, range: f64::from(range[i]) };
@@ -180,7 +182,7 @@ fn check_pictures(
             let (r, target) = (pixel.range / alpha, f64::from(map_range(cell_at(i as u32))));
             let off = (r.max(1e-6) / target.max(1e-6)).ln();
             if target > 0.0 && off.abs() > slack {
-                let v_r = told * f64::from(0.4_f32 / pixels as f32) * off.signum() / r.max(1e-6);
+                let v_r = is_separable * f64::from(0.4_f32 / pixels as f32) * off.signum() / r.max(1e-6);
                 by.range += v_r / alpha;
                 by.alpha -= v_r * r / alpha;
             }
@@ -197,7 +199,7 @@ fn check_pictures(
                     3 if off < 0.6 * 0.05 => 2,
                     3 if off > 0.05 => 1,
                     3 => 0,
-                    told => told,
+                    class => class,
                 };
                 [0.0, -surface / alpha.max(0.05), f64::from(0.7_f32 / pixels as f32)][ends_on as usize]
             }
@@ -211,15 +213,15 @@ fn check_pictures(
             let close = (f64::from(v_blended[i][c]) - by.rgb[c]).abs() < 1e-5 * (1.0 + by.rgb[c].abs());
             assert!(close, "{what}: gradient of pixel {i}, {c}: {} and {}", v_blended[i][c], by.rgb[c]);
         }
-        assert_eq!(seen[i][3], image[i][3], "{what}: alpha stays");
-        // A range of 9 at an alpha near 0 is divided by it.
+        assert_eq!(seen[i][3], image[i][3], "{what}: alpha must not change");
+        // A range of up to 9 is divided by an alpha that may be near 0.
         let scale = 1.0 + by.alpha.abs() + by.range.abs();
         let alpha = f64::from(v_blended[i][3]);
         assert!((alpha - by.alpha).abs() < 2e-5 * scale, "{what}: {i}, alpha {alpha} and {}", by.alpha);
         assert!((f64::from(v_range[i]) - by.range).abs() < 2e-5 * scale, "{what}: range of {i}");
     }
     for (k, (kernel, twin)) in sums(gpu, water.scratch().unwrap()[1]).iter().zip(v_water).enumerate() {
-        // Sums of `pixels` numbers of up to about 5, most of which cancel.
+        // Sums of `pixels` numbers up to about 5, which mostly cancel.
         assert!(
             (kernel - twin).abs() < 2e-5 * f64::from(pixels).max(1.0),
             "{what}: {k}: {kernel} and {twin}"
@@ -233,7 +235,7 @@ fn under_water(gpu: &Arc<Gpu>, blend: Blend, seed: u32, sh_degree: u8) -> View {
         background: [0.0; 3],
         ..Scene::new("under water", samples::random(seed, 300, sh_degree), 75, 53)
     };
-    // With moments in f32 the first step of Adam is as long as its rate.
+    // With f32 moments, Adam's first step is as long as its rate.
     let blocks = View::render_with(gpu, &scene, Moments::F32).blocks;
     let mut view = View::prepare(gpu, &scene, blocks);
     view.uniform.medium = match blend {
@@ -274,7 +276,7 @@ fn splats_under_water_have_the_colours_of_the_twin() {
 }
 
 #[test]
-fn gradients_of_gaussians_and_of_the_nine_numbers_are_those_of_the_twin() {
+fn gradients_of_gaussians_and_water_parameters_match_the_twin() {
     for gpu in layouts() {
         for (blend, sh_degree) in [(Blend::Srgb, 0), (Blend::Srgb, 2), (Blend::Linear, 2)] {
             let view = under_water(&gpu, blend, 172, sh_degree);
@@ -313,7 +315,10 @@ fn gradients_of_gaussians_and_of_the_nine_numbers_are_those_of_the_twin() {
                     }
                 }
                 let share = (difference / length).sqrt();
-                assert!(length > 0.0 && share < 2e-4, "{kind}: they differ by {share:e} of their length");
+                assert!(
+                    length > 0.0 && share < 2e-4,
+                    "{kind}: the gradients differ by {share:e} of their length"
+                );
             }
 
             let config = with((Medium::PerGaussian, blend));
@@ -334,7 +339,7 @@ fn gradients_of_gaussians_and_of_the_nine_numbers_are_those_of_the_twin() {
             for (k, (kernel, twin)) in kernel.iter().zip(v_water).enumerate() {
                 assert!((kernel - twin).abs() < 1e-4 * size, "{k}: {kernel} and {twin}");
             }
-            // And the step that follows from them.
+            // The step from these gradients.
             let mut twin = WaterState::new(&WATER, 3.2);
             twin.step(&kernel, 3.2, 0.01, 0.0);
             let (found, expected) =
@@ -347,10 +352,10 @@ fn gradients_of_gaussians_and_of_the_nine_numbers_are_those_of_the_twin() {
 }
 
 #[test]
-fn the_constant_colour_moves_faster_the_less_is_seen_of_it_and_higher_bands_as_in_air() {
+fn only_the_constant_colour_moves_faster_the_less_it_is_seen() {
     const RATES: [f64; 2] = [1e-2, 5e-4];
     let Some(gpu) = device() else { return };
-    // By pixel too, where the water is not in the colours of Gaussians.
+    // Also with water on pixels, where the colours of Gaussians contain no water.
     for medium in [medium::PER_GAUSSIAN_SRGB, medium::AS_SHOWN, medium::OVER_BLACK] {
         let mut view = under_water(&gpu, Blend::Srgb, 174, 2);
         view.uniform.medium = medium;
@@ -368,14 +373,14 @@ fn the_constant_colour_moves_faster_the_less_is_seen_of_it_and_higher_bands_as_i
             let lr_scale = lr_scale_under_water(&WATER, splat.rgb.map(|s| s.max(0.0)), splat.range);
             for p in 11..after.parameters() {
                 let moved = (after.parameter(id, p) - before.parameter(id, p)).abs();
-                // No pixel shows it, or its colour is cut off at 0.
+                // No pixel shows it, or its colour is clamped at 0.
                 if moved == 0.0 {
                     continue;
                 }
                 let c = (p - 11) % 3;
                 let expected = if p < 14 { RATES[0] * lr_scale[c] } else { RATES[1] };
                 let name = Gaussians64::parameter_name(p);
-                // The slopes are powers in f32, and coefficients of order 1 have a spacing of 1e-7.
+                // The slopes are powers in f32, and coefficients near 1 have a spacing of 1e-7.
                 assert!((moved / expected - 1.0).abs() < 2e-3, "{name} of {id}: {moved}, not {expected}");
                 (compared, fastest) = (compared + 1, fastest.max(lr_scale[c]));
             }
@@ -385,12 +390,12 @@ fn the_constant_colour_moves_faster_the_less_is_seen_of_it_and_higher_bands_as_i
 }
 
 #[test]
-fn a_gradient_that_is_not_finite_moves_no_number_and_is_counted() {
+fn a_nan_gradient_moves_no_water_parameter_and_is_counted() {
     for gpu in layouts() {
         let mut frame = Frame::new(&gpu, 1, 1, 1).unwrap();
         frame.prepare_targets(&gpu, [8, 8]).unwrap();
         let blocks = Blocks::new(&gpu, 0).unwrap();
-        let mut water = DeviceMedium::new(&gpu, medium_run(with(WAYS[2]), WATER)).unwrap();
+        let mut water = DeviceMedium::new(&gpu, medium_run(with(COMPOSITIONS[2]), WATER)).unwrap();
         water.give_to(&gpu, &frame);
         water.prepare(&gpu, [8, 8], 1, 1).unwrap();
         let before = water.water(&gpu, &frame).unwrap();
@@ -411,9 +416,12 @@ fn a_gradient_that_is_not_finite_moves_no_number_and_is_counted() {
         assert_eq!((after, left_out), (before, 1));
         let (after, left_out) = once([0.1; 4], 2);
         assert_eq!(left_out, 1);
-        assert!(after.b_inf.iter().zip(before.b_inf).all(|(a, b)| *a < b), "open water gets darker");
+        assert!(after.b_inf.iter().zip(before.b_inf).all(|(a, b)| *a < b), "open water must get darker");
         for (after, before) in after.beta_d.iter().zip(before.beta_d) {
-            assert!((after / before - 1.0).abs() < 1e-5, "nothing says how far: {after} and {before}");
+            assert!(
+                (after / before - 1.0).abs() < 1e-5,
+                "nothing depends on range, so beta_d must stay: {after} and {before}"
+            );
         }
     }
 }
@@ -424,10 +432,10 @@ pub fn watery(photographs: &InMemory, config: TrainConfig, water: WaterConfig) -
 }
 
 #[test]
-fn a_run_under_water_depends_on_neither_interruptions_nor_lists_nor_bands() {
+fn interruptions_short_lists_and_bands_change_no_byte() {
     let Some(gpu) = device() else { return };
     let photographs = photographs(&gpu, 64, 48);
-    // As they come, with all terms on the way to their weights, and as printed.
+    // Every composition, one with all loss terms while their weights rise, and the settings of the paper.
     let rising = PriorsConfig {
         dark_channel: 1.0,
         dark_channel_patch: 9,
@@ -437,8 +445,8 @@ fn a_run_under_water_depends_on_neither_interruptions_nor_lists_nor_bands() {
         rise: 0.6,
         ..PriorsConfig::default()
     };
-    let all_terms = WaterConfig { priors: rising, loss_light: LossLight::Linear, ..with(WAYS[0]) };
-    for water in WAYS.map(with).into_iter().chain([all_terms, WaterConfig::paper()]) {
+    let all_terms = WaterConfig { priors: rising, loss_light: LossLight::Linear, ..with(COMPOSITIONS[0]) };
+    for water in COMPOSITIONS.map(with).into_iter().chain([all_terms, WaterConfig::paper()]) {
         let new = || watery(&photographs, config(30), water.clone());
         let learnt = |trainer: &mut Trainer| trainer.water().unwrap().unwrap().to_array().map(f64::to_bits);
         same_however_it_runs(&gpu, &format!("{water:?}"), new, [0, 1, 13, 25], BANDED, learnt);
@@ -446,11 +454,11 @@ fn a_run_under_water_depends_on_neither_interruptions_nor_lists_nor_bands() {
 }
 
 #[test]
-fn a_water_that_is_frozen_stays_and_colours_are_plain_while_it_moves_where_that_is_wanted() {
+fn frozen_water_stays_and_sh0_while_free_delays_harmonics() {
     let Some(gpu) = device() else { return };
     let photographs = photographs(&gpu, 48, 36);
     let frozen = {
-        let mut run = watery(&photographs, config(20), with(WAYS[0]));
+        let mut run = watery(&photographs, config(20), with(COMPOSITIONS[0]));
         run.medium.as_mut().unwrap().is_free = false;
         run
     };
@@ -460,28 +468,28 @@ fn a_water_that_is_frozen_stays_and_colours_are_plain_while_it_moves_where_that_
     assert_eq!(trainer.water().unwrap(), before);
     let view_dependence =
         |model: &Gaussians| model.sh_coeffs.iter().skip(1).step_by(4).flatten().any(|c| *c != 0.0);
-    assert!(
-        view_dependence(&trainer.gaussians().unwrap()),
-        "a frozen water leaves the schedule of harmonics"
-    );
+    assert!(view_dependence(&trainer.gaussians().unwrap()), "a frozen water must not delay the harmonics");
 
     let moving = |sh0_while_free| {
-        let water = WaterConfig { freeze_at: 0.5, sh0_while_free, ..with(WAYS[0]) };
+        let water = WaterConfig { freeze_at: 0.5, sh0_while_free, ..with(COMPOSITIONS[0]) };
         let mut trainer = Trainer::new(Arc::clone(&gpu), watery(&photographs, config(60), water)).unwrap();
         trainer.advance(30).unwrap();
         trainer
     };
-    assert!(view_dependence(&moving(false).gaussians().unwrap()), "harmonics wait for the water");
+    assert!(view_dependence(&moving(false).gaussians().unwrap()), "harmonics must not wait for the water");
     let mut trainer = moving(true);
-    assert!(!view_dependence(&trainer.gaussians().unwrap()), "no view dependence while the water moves");
+    assert!(
+        !view_dependence(&trainer.gaussians().unwrap()),
+        "colours must not depend on direction while the water moves"
+    );
     let moved = trainer.water().unwrap();
     assert_ne!(moved, before);
     trainer.advance(30).unwrap();
-    assert_eq!(trainer.water().unwrap(), moved, "after its part of the run it stays");
+    assert_eq!(trainer.water().unwrap(), moved, "the water must stay after its part of the run");
     assert!(view_dependence(&trainer.gaussians().unwrap()));
 }
 
-/// Photographs through water from near and far: else attenuation and colour cannot be told apart.
+/// Photographs through water from near and far. Without both, attenuation and colour cannot be separated.
 pub fn sunk(gpu: &Arc<Gpu>, water: WaterView) -> InMemory {
     let mut views = Vec::new();
     for (i, distance) in [1.7, 2.4, 3.2, 4.5, 6.5, 9.0].into_iter().enumerate() {
@@ -502,7 +510,7 @@ pub fn sunk(gpu: &Arc<Gpu>, water: WaterView) -> InMemory {
 }
 
 #[test]
-fn training_finds_the_numbers_that_the_prior_does_not_know_and_leaves_the_others() {
+fn training_finds_the_unknown_water_parameters_and_keeps_others() {
     let Some(gpu) = device() else { return };
     let composition = Composition::GaussiansSrgb;
     let wet = sunk(
@@ -515,7 +523,7 @@ fn training_finds_the_numbers_that_the_prior_does_not_know_and_leaves_the_others
             output: Output::Underwater,
         },
     );
-    let mut run = watery(&wet, config(400), WaterConfig { lr: 0.03, ..with(WAYS[0]) });
+    let mut run = watery(&wet, config(400), WaterConfig { lr: 0.03, ..with(COMPOSITIONS[0]) });
     let medium = run.medium.as_mut().unwrap();
     medium.water = Water { b_inf: [0.1; 3], ..WATER };
     medium.standard_error = Some(std::array::from_fn(|i| if i < 6 { 1e-4 } else { f64::INFINITY }));
@@ -532,7 +540,7 @@ fn training_finds_the_numbers_that_the_prior_does_not_know_and_leaves_the_others
     let seen = each.sum::<f64>() / wet.views.len() as f64;
     assert!(seen > 28.0, "I: {seen:.2} dB, {found:?}");
     for (k, (found, truth)) in found.to_array().iter().zip(WATER.to_array()).enumerate() {
-        // It is 0.075, 0.01 and 0.09 away at the start.
+        // At the start, `b_inf` is 0.075, 0.01 and 0.09 away.
         let bound = if k < 6 { 0.01 * truth } else { 0.006 };
         assert!((found - truth).abs() < bound, "{k}: {found} and {truth}");
     }
@@ -542,19 +550,19 @@ fn training_finds_the_numbers_that_the_prior_does_not_know_and_leaves_the_others
 }
 
 #[test]
-fn bare_surfaces_are_covered_when_density_is_decided_for_the_last_time() {
+fn the_last_density_step_covers_bare_surfaces() {
     let Some(gpu) = device() else { return };
     let photographs = photographs(&gpu, 64, 48);
-    // Where no view looks, so that what is put there stays as it is.
+    // No view sees this place, so Gaussians that are put there stay unchanged.
     let mut surfaces = samples::random(77, 12, 1);
     surfaces.means.iter_mut().enumerate().for_each(|(i, mean)| *mean = [900.0 + 10.0 * i as f32, 0.0, 0.0]);
-    // As many that are so faint that they give way.
+    // The same number of Gaussians that are faint enough to be replaced.
     let mut faint = surfaces.clone();
     faint.means.iter_mut().for_each(|mean| mean[0] = -mean[0]);
     faint.opacity_logits.fill(-3.0);
     let covered = |least_cover: f32, strategy: Strategy| {
         let config = TrainConfig { strategy, ..config(30) };
-        let run = watery(&photographs, config, WaterConfig { least_cover, ..with(WAYS[0]) });
+        let run = watery(&photographs, config, WaterConfig { least_cover, ..with(COMPOSITIONS[0]) });
         let cap = run.config.max_gaussians as usize;
         let mut focus = run.focus.clone();
         (0..faint.len()).for_each(|index| focus.push_from(&faint, index));
@@ -562,7 +570,7 @@ fn bare_surfaces_are_covered_when_density_is_decided_for_the_last_time() {
             Trainer::new(Arc::clone(&gpu), TrainRun { focus, surfaces: surfaces.clone(), ..run }).unwrap();
         trainer.advance(30).unwrap();
         let model = trainer.gaussians().unwrap();
-        assert!(model.len() <= cap, "{} Gaussians", model.len());
+        assert!(model.len() <= cap, "{} Gaussians, at most {cap}", model.len());
         surfaces.means.iter().filter(|mean| model.means.contains(mean)).count()
     };
     for strategy in [Strategy::Mcmc, Strategy::Classic] {

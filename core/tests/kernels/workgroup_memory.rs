@@ -1,4 +1,4 @@
-//! No kernel reads workgroup memory that it has not written: pipelines leave out to clear it.
+//! No kernel reads workgroup memory before writing it. Pipelines do not clear this memory.
 
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -15,8 +15,8 @@ use crate::device::{assert_same_bits, layouts, poison, storage};
 use crate::view::{ImageGradients, Scene, View, gradients_only};
 use crate::water::{fixed, gradients_of};
 
-/// A kernel with all the workgroup memory that an adapter surely has. `fill` leaves a NaN in each word;
-/// `look` counts the words that hold it without having written any.
+/// Two kernels that use all the workgroup memory that every adapter has. `fill` leaves a NaN in each word;
+/// `look` writes nothing and counts the words that hold that NaN.
 struct Rubbish {
     gpu: Arc<Gpu>,
     fill: wgpu::ComputePipeline,
@@ -68,7 +68,7 @@ impl Rubbish {
         Self { gpu: Arc::clone(gpu), fill, look, counts: storage(gpu, &[0_u32; 2]) }
     }
 
-    /// On as many workgroups as reach every core that a kernel may run on later.
+    /// Dispatches enough workgroups to reach every core that later kernels may use.
     fn run(&self, pipeline: &wgpu::ComputePipeline) {
         let group = self.gpu.device().create_bind_group(&wgpu::BindGroupDescriptor {
             label: None,
@@ -85,7 +85,7 @@ impl Rubbish {
         self.gpu.wait().unwrap();
     }
 
-    /// Whether the next kernel finds what was filled in.
+    /// Whether the next kernel finds the NaNs of `fill`.
     fn stays(&self) -> bool {
         self.run(&self.fill);
         self.run(&self.look);
@@ -95,7 +95,7 @@ impl Rubbish {
 
 static RUBBISH: Mutex<Option<Rubbish>> = Mutex::new(None);
 
-/// The clock of a stepped recording: before each dispatch, and after.
+/// Serves as the clock of a stepped recording, so it runs before and after each dispatch.
 fn fill() -> f64 {
     if let Some(rubbish) = &*RUBBISH.lock().unwrap_or_else(PoisonError::into_inner) {
         rubbish.run(&rubbish.fill);
@@ -103,8 +103,7 @@ fn fill() -> f64 {
     0.0
 }
 
-/// Forward, exposure, loss, water, view embedding and backward of one view: everything that they leave
-/// behind.
+/// The outputs of forward, exposure, loss, water, view embedding and backward of one view.
 fn iteration(gpu: &Arc<Gpu>, recorder: fn(&Gpu) -> Recorder<'_>) -> [Vec<u32>; 8] {
     let scene = Scene::new("random", samples::random(161, 300, 2), 75, 53);
     let view = View::render(gpu, &scene);
@@ -176,7 +175,7 @@ fn iteration(gpu: &Arc<Gpu>, recorder: fn(&Gpu) -> Recorder<'_>) -> [Vec<u32>; 8
         arrays.iter().flat_map(|(buffer, bytes)| words(buffer, *bytes as u64 / 4)).collect()
     };
     let of_water = all(&water.arrays(&view.frame));
-    // A water that follows from range, and a view embedding.
+    // A water with DBDR, and a view embedding.
     let maps = WaterConfig {
         medium: Medium::PerPixel,
         blend: Blend::Linear,
@@ -210,15 +209,13 @@ fn iteration(gpu: &Arc<Gpu>, recorder: fn(&Gpu) -> Recorder<'_>) -> [Vec<u32>; 8
 }
 
 #[test]
-fn rubbish_in_workgroup_memory_before_every_kernel_changes_no_byte() {
+fn rubbish_in_workgroup_memory_changes_no_byte() {
     for gpu in layouts() {
         let rubbish = Rubbish::new(&gpu);
-        // Else nothing would be proven. Where a driver clears it by itself there is nothing to prove. Not at
-        // once: between two kernels a driver's thread may have worked for another test.
-        assert!(
-            (0..50).any(|_| rubbish.stays()) || !gpu.adapter().is_cpu,
-            "the rubbish is gone before a kernel could read it"
-        );
+        // The rubbish must survive for this test to prove anything. GPU drivers may clear it, so only CPU
+        // adapters must keep it. Several tries, because a driver thread may run another test between two
+        // kernels.
+        assert!((0..50).any(|_| rubbish.stays()) || !gpu.adapter().is_cpu, "no kernel can read the rubbish");
         let plain = iteration(&gpu, |gpu| Recorder::new(gpu));
         *RUBBISH.lock().unwrap_or_else(PoisonError::into_inner) = Some(rubbish);
         let filled = iteration(&gpu, |gpu| Recorder::stepped(gpu, fill));

@@ -1,4 +1,4 @@
-//! What benchmarks count and how they take times.
+//! The counts and times of benchmarks.
 
 use std::sync::atomic::{AtomicU32, Ordering};
 
@@ -9,7 +9,7 @@ use fathom_twins::samples;
 use crate::device::device;
 use crate::view::{Scene, View};
 
-/// Gaussians of this opacity, one behind the other, each wider than the picture.
+/// Gaussians of this opacity in a row along the view, each wider than the picture.
 fn stack(count: usize, opacity_logit: f32) -> Scene {
     let mut model = Gaussians::empty(0);
     for i in 0..count {
@@ -23,7 +23,7 @@ fn stack(count: usize, opacity_logit: f32) -> Scene {
 }
 
 #[test]
-fn evaluations_are_counted_for_whole_tiles_and_needed_until_every_ray_has_ended() {
+fn evaluations_count_whole_tiles_and_are_needed_until_rays_end() {
     let Some(gpu) = device() else { return };
     let count = 60;
     for (opacity_logit, ends) in [(-4.0, false), (10.0, true)] {
@@ -34,22 +34,25 @@ fn evaluations_are_counted_for_whole_tiles_and_needed_until_every_ray_has_ended(
         assert_eq!((work.visible, work.intersections), (count as u32, tiles * count as u32));
         assert_eq!(work.listed_evaluations, all);
         if ends {
-            // An alpha of at least 0.99: two or three of the sixty.
+            // Opacity 0.99995: a ray ends after two or three of the sixty.
             assert!(work.needed_evaluations > 0 && work.needed_evaluations <= all / 20, "{work:?}");
         } else {
-            assert_eq!(work.needed_evaluations, all, "six tenths of the light are left behind the last");
+            assert_eq!(
+                work.needed_evaluations, all,
+                "at least a third of the light passes the last Gaussian"
+            );
         }
     }
 }
 
-/// Ticks once each time that it is read.
+/// A clock that advances by one tick at each reading.
 fn ticking() -> f64 {
     static TICKS: AtomicU32 = AtomicU32::new(0);
     f64::from(TICKS.fetch_add(1, Ordering::Relaxed))
 }
 
 #[test]
-fn a_recording_that_is_stepped_through_has_the_stages_and_the_bytes_of_one_submission() {
+fn a_stepped_recording_gives_the_bytes_of_one_submission() {
     let Some(gpu) = device() else { return };
     let scene = Scene::new("random", samples::random(5, 300, 2), 75, 53);
     let view = View::render(&gpu, &scene);
@@ -58,13 +61,13 @@ fn a_recording_that_is_stepped_through_has_the_stages_and_the_bytes_of_one_submi
         gpu.write(&view.frame.targets().unwrap().image, 0, &vec![[7.0_f32; 4]; view.pixels()]);
         view.frame.record_forward(&gpu, &mut recorder, &view.blocks, &view.uniform).unwrap();
         let times = recorder.submit_timed().unwrap();
-        assert!(view.image() == image, "the same picture");
+        assert!(view.image() == image, "the pictures must be the same");
         times
     };
     let stepped = run(Recorder::stepped(&gpu, ticking));
     assert!(stepped.iter().any(|time| time.kernel == "sort_scatter" && time.dispatches > 1), "{stepped:?}");
     for time in &stepped {
-        assert_eq!(time.seconds, f64::from(time.dispatches), "{}: a tick a dispatch", time.kernel);
+        assert_eq!(time.seconds, f64::from(time.dispatches), "{}: one tick per dispatch", time.kernel);
     }
     if gpu.has_timestamps() {
         let names =

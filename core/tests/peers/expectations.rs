@@ -1,17 +1,17 @@
-//! Reading what the scripts recorded, and comparing numbers with it.
+//! Reads the records of the scripts and compares numbers with them.
 
 use std::path::Path;
 
 use serde::de::DeserializeOwned;
 
-/// Relative error that is allowed. Both sides compute in f64; with 17 recorded digits the worst over all
-/// files is 7e-12 (a gradient that is a sum of cancelling terms), and recording 11 digits adds 5e-12.
+/// Allowed relative error. Both sides compute in f64. With 17 recorded digits, the worst error over all files
+/// is 7e-12, of a gradient whose terms cancel. Recording 11 digits adds 5e-12.
 const RELATIVE: f64 = 1e-10;
-/// Numbers smaller than this share of the largest of their kind are compared with that share instead: what is
-/// a sum of large terms that cancel carries their rounding.
+/// Numbers below this share of the largest of their kind get the tolerance of that share: a sum of large
+/// terms that cancel has the rounding error of those terms.
 const SMALL: f64 = 1e-3;
 
-/// What `expectations/<name>.json` holds.
+/// The content of `expectations/<name>.json`.
 pub fn read<T: DeserializeOwned>(name: &str) -> T {
     let path =
         Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/peers/expectations").join(format!("{name}.json"));
@@ -19,7 +19,7 @@ pub fn read<T: DeserializeOwned>(name: &str) -> T {
     serde_json::from_str(&text).unwrap_or_else(|e| panic!("{}: {e}", path.display()))
 }
 
-/// Fails unless every row of `ours` is the row of `theirs` up to [`RELATIVE`].
+/// Fails unless every row of `ours` equals the row of `theirs` up to [`RELATIVE`].
 #[track_caller]
 pub fn assert_rows_close<const N: usize>(what: &str, ours: &[[f64; N]], theirs: &[[f64; N]]) {
     assert_eq!(ours.len(), theirs.len(), "{what}: rows");
@@ -37,7 +37,7 @@ pub fn assert_rows_close<const N: usize>(what: &str, ours: &[[f64; N]], theirs: 
     }
 }
 
-/// The same for one number a row.
+/// The same for one number per row.
 #[track_caller]
 pub fn assert_close(what: &str, ours: &[f64], theirs: &[f64]) {
     let rows = |values: &[f64]| -> Vec<[f64; 1]> { values.iter().map(|&v| [v]).collect() };

@@ -1,20 +1,20 @@
 #!/usr/bin/env python3
-"""Records what gsplat's PyTorch reference gives for seeded scenes: images, and gradients by autograd, in float64.
+"""Records the images and gradients of gsplat's PyTorch reference with autograd for seeded scenes, in float64.
 
     python3 -m venv .venv && .venv/bin/pip install -r core/tests/peers/requirements.txt
     .venv/bin/python core/tests/peers/make_expectations.py
 
-`main.rs` compares the twins in `core/twins/src` with the files that this writes into `expectations/`. README.md
-says which conventions differ.
+`main.rs` compares the twins in `core/twins/src` with the files that this script writes to `expectations/`. README.md
+lists the conventions that differ.
 
-What is gsplat's (`gsplat/cuda/_torch_impl.py`), called as its `rendering.py` calls it: covariances from quaternions and
-scales, projection, spherical harmonics, tile lists, alpha, blending (by nerfacc's products and sums along a ray), and
-through autograd every derivative. What is not:
+gsplat (`gsplat/cuda/_torch_impl.py`, called as in its `rendering.py`) computes: covariances from quaternions and
+scales, projection, spherical harmonics, tile lists, alpha, and blending, with nerfacc's products and sums along a ray.
+autograd computes every derivative. This script handles:
 
-- Which pairs of pixel and Gaussian are blended. gsplat has only a CUDA kernel for this; `PairsToBlend` goes by its rule
-  over gsplat's own tile lists. A choice has no derivative, so no gradient comes from this script.
-- nerfacc takes rays of different lengths only on CUDA; `weights_in_rows` hands them to its batched form.
-- exp of log scales, sigmoid of opacity logits, max(SH + 0.5, 0): one line each, as wherever gsplat is used.
+- The pairs of pixel and Gaussian that are blended. gsplat only has a CUDA kernel for this; `PairsToBlend` applies its
+  rule to gsplat's own tile lists. A choice has no derivative, so no gradient comes from this script.
+- Rays of different lengths. nerfacc accepts them only on CUDA; `weights_in_rows` passes them to its batched form.
+- exp of log scales, sigmoid of opacity logits, max(SH + 0.5, 0): one line each, as in all code that calls gsplat.
 - Range. gsplat blends z; here its blending gets the distance from the camera as a fourth channel.
 """
 
@@ -33,10 +33,10 @@ NEAR = 0.01
 TILE = 16
 MIN_ALPHA = 1.0 / 255.0
 MIN_TRANSMITTANCE = 1e-4
-# The cap of alpha: ours, and the one that is written into gsplat.
+# The cap of alpha: ours, and the constant in gsplat.
 OUR_CAP = 0.99
 GSPLAT_CAP = 0.999
-# A decision nearer to its edge than this, relative, could fall the other way by rounding.
+# Rounding could change a decision that is closer to its edge than this relative distance.
 CLEARANCE = 1e-9
 
 
@@ -44,7 +44,7 @@ CLEARANCE = 1e-9
 
 
 class PairsToBlend:
-    """Takes the place of gsplat's `rasterize_to_indices_in_range` for one image, and counts where its edges acted."""
+    """Replaces gsplat's `rasterize_to_indices_in_range` for one image, and counts the effects of its edges."""
 
     def __init__(self, cap, in_front):
         self.cap = cap
@@ -56,15 +56,16 @@ class PairsToBlend:
     def __call__(
         self, start, _end, _left, means2d, conics, opacities, width, height, tile_size, offsets, flatten_ids
     ):
-        """(Gaussians, pixels, images) of all pairs that are blended: pixel by pixel, front to back."""
-        assert start == 0 and len(offsets) == 1, "one image, and few enough Gaussians for gsplat's first batch"
+        """(Gaussians, pixels, images) of all blended pairs: pixel by pixel, front to back."""
+        assert start == 0 and len(offsets) == 1, "one image, with Gaussians that fit gsplat's first batch"
         lists = numpy.split(flatten_ids.numpy(), offsets.flatten()[1:].numpy())
         gaussians, pixels = [], []
         for y in range(height):
             for x in range(width):
                 alphas = alphas_at(x, y, means2d[0], conics[0], opacities[0])
                 listed = lists[y // tile_size * offsets.shape[-1] + x // tile_size]
-                # Neither gsplat's box of 3.33 sigma nor our ellipse leaves out what is above the least alpha.
+                # Neither gsplat's box of 3.33 sigma nor our ellipse may exclude a Gaussian above
+                # the least alpha.
                 assert set(numpy.flatnonzero((alphas >= MIN_ALPHA) & self.in_front)) <= set(listed)
                 blended = self.blended([int(gaussian) for gaussian in listed], alphas)
                 gaussians += blended
@@ -72,7 +73,7 @@ class PairsToBlend:
         return torch.tensor(gaussians), torch.tensor(pixels), torch.zeros(len(pixels), dtype=torch.int64)
 
     def blended(self, listed, alphas):
-        """Those of `listed` (front to back) that one pixel blends; `alphas` are not capped yet."""
+        """The Gaussians of `listed` (front to back) that one pixel blends; `alphas` are not capped yet."""
         result, left = [], 1.0
         for gaussian in listed:
             alpha = alphas[gaussian]
@@ -80,7 +81,7 @@ class PairsToBlend:
             if alpha < MIN_ALPHA:
                 continue
             after = left * (1.0 - min(alpha, self.cap))
-            # Two at our cap leave 1.0000000000000018e-4: on by gsplat's T <= 1e-4 and by our T < 1e-4.
+            # Two at our cap leave 1.0000000000000018e-4: neither gsplat's T <= 1e-4 nor our T < 1e-4 stops.
             assert clear(after, MIN_TRANSMITTANCE) or after == (1.0 - OUR_CAP) ** 2
             if after < MIN_TRANSMITTANCE:
                 self.stopped_pixels += 1
@@ -101,12 +102,12 @@ def alphas_at(x, y, means2d, conics, opacities):
 
 
 def clear(value, edge):
-    """Whether `value` lies on one side of `edge` for certain."""
+    """Whether rounding cannot move `value` across `edge`."""
     return abs(value - edge) > CLEARANCE * edge
 
 
 def weights_in_rows(alphas, ray_indices, n_rays):
-    """nerfacc's `render_weight_from_alpha` of rays of different lengths, through its form for rays of one length."""
+    """nerfacc's `render_weight_from_alpha` for rays of different lengths, by its function for rays of one length."""
     counts = torch.bincount(ray_indices, minlength=n_rays)
     places = torch.arange(len(ray_indices)) - (torch.cumsum(counts, 0) - counts)[ray_indices]
     rows = torch.zeros(n_rays, int(counts.max())).index_put((ray_indices, places), alphas)
@@ -119,7 +120,7 @@ GSPLAT_ACCUMULATE = _torch_impl.accumulate
 
 
 def rasterize(cap, in_front, means2d, conics, colours, opacities, width, height, offsets, flatten_ids, backgrounds):
-    """gsplat's `_rasterize_to_pixels` with another cap of alpha; also gives the `PairsToBlend` that it used."""
+    """gsplat's `_rasterize_to_pixels` with another cap of alpha; also returns its `PairsToBlend`."""
     code = GSPLAT_ACCUMULATE.__code__
     assert code.co_consts.count(GSPLAT_CAP) == 1, "gsplat has changed its cap of alpha"
     constants = tuple(cap if constant == GSPLAT_CAP else constant for constant in code.co_consts)
@@ -137,11 +138,11 @@ def rasterize(cap, in_front, means2d, conics, colours, opacities, width, height,
 
 
 def random_scene(seed, width, height, count, sh_degree, size_px, stretch, logits, reach, sh_size=0.3):
-    """Gaussians and a camera of any turn whose principal point is off the centre and whose pixels are not square.
+    """Gaussians, and a randomly rotated camera with an off-centre principal point and pixels that are not square.
 
-    `size_px` and `logits` are ranges of standard deviation in the picture and of opacity logits; `stretch` is how much
-    the three scales differ (in e-folds); `reach` is 1 for centres in the picture, larger for some beyond its edges.
-    All numbers are rounded, so that the files hold exactly what was computed with.
+    `size_px` and `logits` are ranges of standard deviation in the picture and of opacity logits. `stretch` is the
+    spread of the three scales (in e-folds). `reach` is 1 for centres in the picture, larger for some beyond its edges.
+    All numbers are rounded, so that the files contain exactly the numbers of the computation.
     """
     rng = numpy.random.default_rng(seed)
     camera = {"width": width, "height": height}
@@ -180,7 +181,7 @@ def random_scene(seed, width, height, count, sh_degree, size_px, stretch, logits
 
 
 def to_world(in_camera, pose):
-    """Points [N, 3] of the camera's frame in the world's, rounded."""
+    """Points [N, 3] from the camera's frame to the world frame, rounded."""
     rotation = _torch_impl._quat_to_rotmat(torch.tensor(pose["quat_wxyz"])).numpy()
     return ((in_camera - pose["translation"]) @ rotation).round(5)
 
@@ -211,15 +212,15 @@ def border():
     """Large Gaussians around the edges and far beyond them; the last four must not be drawn."""
     scene = random_scene(5, 21, 17, 24, 1, (3.0, 16.0), 1.5, (-3.0, 2.0), 2.5)
     model, pose = scene["model"], scene["pose"]
-    # Behind the camera, on its other side, and nearer than the near plane.
+    # Two Gaussians behind the camera, and one nearer than the near plane.
     model["means"][-4:-1] = to_world(numpy.array([[0.1, 0.2, -3.0], [0.0, 0.0, -0.5], [0.001, 0.0, 0.006]]), pose)
-    # Under 1/255 everywhere.
+    # Alpha is below 1/255 everywhere.
     model["opacity_logits"][-1] = -6.0
     return scene
 
 
 SCENES = [crowd, opaque, opaque_gsplat, needles, border]
-# What a scene is there for: the least counts of `observe`.
+# The purpose of each scene: the least counts of `observe`.
 PURPOSE = {
     "crowd": {"black_channels": 3, "blended_pairs": 3000},
     "opaque": {"capped_pairs": 10, "stopped_pixels": 30},
@@ -233,7 +234,7 @@ PURPOSE = {
 
 
 def weights(pixels):
-    """Weights of the loss, [pixels, 5] in -1..1 for R, G, B, alpha and range; `main.rs` has the same formula."""
+    """Weights of the loss, [pixels, 5] in -1..1 for R, G, B, alpha and range; `splatting.rs` has the same formula."""
     k = numpy.arange(5 * pixels, dtype=numpy.int64)
     return torch.tensor((k * k * 31 + k * 7919) % 2003 / 1001.0 - 1.0).reshape(pixels, 5)
 
@@ -275,7 +276,7 @@ def record(make):
     offsets = _torch_impl._isect_offset_encode(isect_ids, 1, tiles_x, tiles_y)
     in_front = (depths[0] > NEAR).numpy()
     z = numpy.sort(depths[0].detach().numpy())
-    assert (numpy.diff(z) > 1e-6).all(), "gsplat sorts by depth in f32, and ties would be anyone's"
+    assert (numpy.diff(z) > 1e-6).all(), "gsplat sorts by depth in f32, so ties would have any order"
     image, alpha, pairs = rasterize(
         scene["cap"],
         in_front,
@@ -295,10 +296,10 @@ def record(make):
 
     shows = observe(scene, viewmat, depths[0], means2d[0], harmonics, pairs)
     for what, least in PURPOSE[name].items():
-        assert shows[what] >= least, f"{name}: {what} is {shows[what]}, at least {least} is what the scene is for"
+        assert shows[what] >= least, f"{name}: {what} is {shows[what]}, but the scene needs at least {least}"
 
     def drawn(values):
-        """By Gaussian, nothing where gsplat's number has no meaning."""
+        """Values by Gaussian; None where gsplat's number has no meaning."""
         return [row.tolist() if front else None for row, front in zip(values.detach()[0], in_front, strict=True)]
 
     recording.write(
@@ -322,7 +323,7 @@ def record(make):
 
 
 def observe(scene, viewmat, depths, means2d, harmonics, pairs):
-    """Counts of what a scene makes happen."""
+    """Counts of the edge cases in a scene."""
     camera, front = scene["camera"], torch.tensor(pairs.in_front)
     size = torch.tensor([camera["width"], camera["height"]], dtype=torch.float64)
     focal = torch.tensor([camera["fx"], camera["fy"]])
@@ -361,7 +362,7 @@ def spherical_harmonics():
     for degree in range(4):
         directions = numpy.concatenate([axes, rng.normal(size=(4, 3)).round(3)])
         directions = torch.tensor(directions, requires_grad=True)
-        # Colours spread alike at every degree, some of them below black.
+        # Colours have the same spread at every degree, and some are below 0.
         size = 2.8 / (degree + 1)
         coeffs = torch.tensor(rng.uniform(-size, size, (10, (degree + 1) ** 2, 3)).round(3), requires_grad=True)
         v_rgb = torch.tensor(rng.uniform(-1, 1, (10, 3)).round(3))

@@ -1,15 +1,15 @@
 #!/usr/bin/env python3
-"""Records what scikit-image and torchmetrics give for PSNR, SSIM and, by autograd, the gradient of the training loss.
+"""Records PSNR and SSIM by scikit-image and torchmetrics, and the gradient of the training loss by autograd.
 
-    .venv/bin/python core/tests/peers/make_metric_expectations.py    # set up as make_expectations.py says
+    .venv/bin/python core/tests/peers/make_metric_expectations.py    # set up as in make_expectations.py
 
-Ours is the SSIM of 3DGS: a window of 11 x 11 with sigma 1.5 whose taps sum to 1, variances divided by that sum (not by
-n - 1), C1 = 0.01^2 and C2 = 0.03^2 on values of 0..1, each channel on its own, zeros beyond the border, the mean over
-all pixels. Window and constants are arguments of the peers or theirs by default. The border is not: scikit-image
-reflects and leaves 5 pixels out of its mean, torchmetrics reflects and takes all. Here both get the pictures inside a
-frame of 5 black pixels, as wide as the window reaches, and their map is read inside the frame: what they do beyond the
-frame is never seen, and no pixel is left out. The mean over that part is taken here, and so is the mask (black in both
-pictures, not in the mean).
+Our SSIM is that of 3DGS: a window of 11 x 11 with sigma 1.5 whose taps sum to 1, and variances divided by that sum (not
+by n - 1). C1 = 0.01^2 and C2 = 0.03^2 on values of 0..1, each channel on its own, zeros beyond the border, the mean
+over all pixels. The peers have this window and these constants as arguments or defaults. Their border differs:
+scikit-image reflects and leaves 5 pixels out of its mean, torchmetrics reflects and uses all pixels. Here both get the
+pictures inside a frame of 5 black pixels, as wide as the reach of the window, and their map is read inside the frame.
+Their border rules only affect the frame, and no pixel is left out. This script takes the mean inside the frame and
+applies the mask (black in both pictures, not in the mean).
 """
 
 import numpy
@@ -27,9 +27,9 @@ REACH = 5
 
 
 def ssim_map_skimage(render, truth):
-    """Map [H, W, 3] of two pictures of 0..1 by scikit-image."""
+    """Map [H, W, 3] of two pictures with values 0..1, by scikit-image."""
     framed = [numpy.pad(image, ((REACH, REACH), (REACH, REACH), (0, 0))) for image in (render, truth)]
-    # With Gaussian weights the window ends at 3.5 sigma: 5 pixels, 11 taps. torchmetrics does the same.
+    # With Gaussian weights, the window ends at 3.5 sigma: 5 pixels, 11 taps. torchmetrics does the same.
     _, full = skimage.metrics.structural_similarity(
         *framed,
         gaussian_weights=True,
@@ -54,7 +54,7 @@ def ssim_map_torchmetrics(render, truth):
 
 
 def psnr(render, truth, mask):
-    """PSNR in dB of the pixels of 8 bits that count; both peers must agree."""
+    """PSNR in dB of the 8-bit pixels that count; both peers must agree."""
     render, truth = render[mask], truth[mask]
     value = skimage.metrics.peak_signal_noise_ratio(truth, render, data_range=255)
     other = torchmetrics.functional.image.peak_signal_noise_ratio(
@@ -64,7 +64,7 @@ def psnr(render, truth, mask):
     return float(value)
 
 
-# ---- Pictures of 8 bits
+# ---- 8-bit pictures
 
 
 def structured(width, height):
@@ -111,7 +111,7 @@ def pictures(rng):
 
 
 def hex_rows(image):
-    """A picture of 8 bits, a text a row."""
+    """An 8-bit picture as one string per row."""
     return [row.tobytes().hex() for row in image]
 
 
@@ -144,7 +144,7 @@ def metric_cases(rng):
 
 
 def loss_case(rng, name, width, height, ssim_weight, ignored):
-    """(1 - w) L1 + w (1 - SSIM) of a render that is not clamped, and its gradient by torchmetrics and autograd."""
+    """(1 - w) L1 + w (1 - SSIM) of an unclamped render, and its gradient by torchmetrics and autograd."""
     truth = (structured(width, height) / 255.0).round(4)
     render = (truth + rng.normal(0, 0.15, truth.shape)).round(4)
     # |difference| has no derivative at 0.
@@ -152,7 +152,7 @@ def loss_case(rng, name, width, height, ssim_weight, ignored):
     mask = torch.tensor(rng.random((height, width, 1)) >= ignored)
     x = torch.tensor(render, requires_grad=True)
     a, b = x * mask, torch.tensor(truth) * mask
-    # Both means are over all pixels, as the trainer's are; ignored ones add nothing.
+    # Both means are over all pixels, as in the trainer; ignored pixels add nothing.
     l1 = (a - b).abs().mean()
     ssim = (ssim_map_torchmetrics(a, b) * mask).mean()
     total = (1.0 - ssim_weight) * l1 + ssim_weight * (1.0 - ssim)

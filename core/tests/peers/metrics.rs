@@ -7,21 +7,21 @@ use serde::Deserialize;
 
 use crate::expectations::{assert_close, assert_rows_close, read};
 
-/// What `make_metric_expectations.py` recorded.
+/// The record of `make_metric_expectations.py`.
 #[derive(Deserialize)]
 struct File {
     pictures: Vec<Pictures>,
     losses: Vec<LossRecord>,
 }
 
-/// Two pictures of 8 bits and what the peers say of them.
+/// Two 8-bit pictures and the results of the peers.
 #[derive(Deserialize)]
 struct Pictures {
     name: String,
-    /// Rows of RGB in hexadecimal digits.
+    /// Rows of RGB as hexadecimal digits.
     render: Vec<String>,
     truth: Vec<String>,
-    /// Rows of 1 (counts) and 0.
+    /// Rows of 1 (counts) and 0 (masked).
     mask: Vec<String>,
     psnr_db: f64,
     ssim: f64,
@@ -45,7 +45,7 @@ struct LossRecord {
 }
 
 impl Pictures {
-    /// Render, in which all pixels count, and truth with the mask.
+    /// The render without a mask, and the true picture with the mask.
     fn packed(&self) -> (PackedImage, PackedImage) {
         let mut truth = packed(&self.truth);
         for (pixel, counts) in truth.pixels.iter_mut().zip(self.mask.concat().bytes()) {
@@ -83,7 +83,7 @@ fn losses() -> Vec<LossRecord> {
 }
 
 #[test]
-fn psnr_is_that_of_scikit_image_and_torchmetrics() {
+fn psnr_matches_scikit_image_and_torchmetrics() {
     for case in pictures() {
         let (render, truth) = case.packed();
         assert_close(&case.name, &[psnr(&render, &truth)], &[case.psnr_db]);
@@ -91,7 +91,7 @@ fn psnr_is_that_of_scikit_image_and_torchmetrics() {
 }
 
 #[test]
-fn ssim_is_that_of_scikit_image_and_torchmetrics_up_to_the_border() {
+fn ssim_matches_scikit_image_and_torchmetrics_with_the_border() {
     for case in pictures() {
         let (render, truth) = case.packed();
         assert_close(&case.name, &[ssim(&render, &truth)], &[case.ssim]);
@@ -99,7 +99,7 @@ fn ssim_is_that_of_scikit_image_and_torchmetrics_up_to_the_border() {
 }
 
 #[test]
-fn the_ssim_map_of_the_loss_is_that_of_scikit_image_and_torchmetrics_at_every_pixel() {
+fn the_ssim_map_of_the_loss_matches_the_peers_at_every_pixel() {
     let mut maps = 0;
     for case in pictures() {
         let Some(theirs) = &case.ssim_map_red else { continue };
@@ -113,7 +113,7 @@ fn the_ssim_map_of_the_loss_is_that_of_scikit_image_and_torchmetrics_at_every_pi
 }
 
 #[test]
-fn the_loss_is_that_of_torchmetrics() {
+fn the_loss_matches_torchmetrics() {
     for case in losses() {
         let ours = case.ours();
         assert_close(&case.name, &[ours.l1, ours.ssim, ours.total], &[case.l1, case.ssim, case.total]);
@@ -121,7 +121,7 @@ fn the_loss_is_that_of_torchmetrics() {
 }
 
 #[test]
-fn the_gradient_of_the_loss_is_that_of_autograd_through_torchmetrics() {
+fn the_loss_gradient_matches_autograd_through_torchmetrics() {
     for case in losses() {
         assert_rows_close(&case.name, &case.ours().v_rgb, &case.v_rgb);
     }

@@ -1,16 +1,16 @@
-"""How both scripts write what the peers gave: JSON, one row of an array a line, so that a diff can be read."""
+"""Writes the results of the peers as JSON with one row of an array per line, so that diffs are readable."""
 
 import importlib.metadata
 import json
 import pathlib
 
 FOLDER = pathlib.Path(__file__).parent / "expectations"
-# Significant digits of what is recorded. The tests compare at 1e-10, the f64 sums behind agree far better.
+# Significant recorded digits. The tests compare at 1e-10; the f64 sums themselves agree far better.
 DIGITS = 11
 
 
 def versions(*packages):
-    """Versions of what computed the numbers, by the name of the package."""
+    """Versions of the packages that computed the numbers, by package name."""
     return {package: importlib.metadata.version(package) for package in packages}
 
 
@@ -30,6 +30,6 @@ def _text(value):
     if isinstance(value, list):
         return "[" + ",".join(_text(part) for part in value) + "]"
     if isinstance(value, float):
-        # Whole numbers keep no ".0": JSON does not tell 1 from 1.0, and the tests read f64.
+        # Whole numbers have no ".0": JSON does not distinguish 1 from 1.0, and the tests read f64.
         return f"{value:.{DIGITS}g}"
     return json.dumps(value)

@@ -1,4 +1,4 @@
-//! Spherical harmonics against gsplat's: values, and gradients by coefficients and direction.
+//! Spherical harmonics against gsplat: values, and gradients with respect to coefficients and direction.
 
 use fathom_twins::{sh_colour, sh_colour_backward};
 use glam::DVec3;
@@ -11,7 +11,7 @@ struct File {
     cases: Vec<Case>,
 }
 
-/// One Gaussian seen along `direction`, which is not of length 1; (degree + 1)^2 coefficients.
+/// One Gaussian seen along `direction`, which is not normalised; (degree + 1)^2 coefficients.
 #[derive(Deserialize)]
 struct Case {
     direction: [f64; 3],
@@ -28,29 +28,29 @@ impl Case {
     }
 }
 
-/// All cases of one degree, for every degree.
+/// All cases, grouped by degree.
 fn by_degree() -> Vec<(usize, Vec<Case>)> {
     let mut degrees: Vec<(usize, Vec<Case>)> = (0..=3).map(|degree| (degree, Vec::new())).collect();
     for case in read::<File>("spherical_harmonics").cases {
         let degree = case.coeffs.len().isqrt() - 1;
         degrees[degree].1.push(case);
     }
-    assert!(degrees.iter().all(|(_, cases)| cases.len() >= 10), "directions at every degree");
+    assert!(degrees.iter().all(|(_, cases)| cases.len() >= 10), "every degree needs at least 10 directions");
     degrees
 }
 
 #[test]
-fn colours_by_direction_are_gsplats_at_every_degree() {
+fn colours_by_direction_match_gsplat_at_every_degree() {
     for (degree, cases) in by_degree() {
         let ours: Vec<_> = cases.iter().map(|case| sh_colour(case.unit(), &case.coeffs)).collect();
         let theirs: Vec<_> = cases.iter().map(|case| case.rgb).collect();
         assert_rows_close(&format!("colour at degree {degree}"), &ours, &theirs);
-        assert!(theirs.iter().flatten().any(|&v| v == 0.0), "degree {degree}: a channel that is clamped");
+        assert!(theirs.iter().flatten().any(|&v| v == 0.0), "degree {degree}: no channel is clamped");
     }
 }
 
 #[test]
-fn gradients_of_sh_coefficients_are_gsplats_at_every_degree() {
+fn gradients_of_sh_coefficients_match_gsplat_at_every_degree() {
     for (degree, cases) in by_degree() {
         let (mut ours, mut theirs) = (Vec::new(), Vec::new());
         for case in &cases {
@@ -64,19 +64,19 @@ fn gradients_of_sh_coefficients_are_gsplats_at_every_degree() {
 }
 
 #[test]
-fn gradients_of_the_viewing_direction_are_gsplats_at_every_degree() {
+fn gradients_of_viewing_direction_match_gsplat_at_every_degree() {
     for (degree, cases) in by_degree() {
         let v_direction = |case: &Case| {
             let mut ignored = vec![[0.0; 3]; case.coeffs.len()];
             let free = sh_colour_backward(case.unit(), &case.coeffs, case.v_rgb, &mut ignored);
-            // Through direction / |direction|, as project_backward does.
+            // Through direction / |direction|, as in project_backward.
             let tangent = free - case.unit() * case.unit().dot(free);
             (tangent / DVec3::from(case.direction).length()).to_array()
         };
         let ours: Vec<_> = cases.iter().map(v_direction).collect();
         let theirs: Vec<_> = cases.iter().map(|case| case.v_direction).collect();
         if degree == 0 {
-            assert_eq!(ours, theirs, "the constant harmonic does not depend on the direction");
+            assert_eq!(ours, theirs, "the constant harmonic must not depend on the direction");
         } else {
             assert_rows_close(&format!("gradient of direction at degree {degree}"), &ours, &theirs);
         }

@@ -9,7 +9,7 @@ use serde::Deserialize;
 
 use crate::expectations::{assert_close, assert_rows_close, read};
 
-/// What `make_expectations.py` recorded of one scene.
+/// The record of one scene by `make_expectations.py`.
 #[derive(Deserialize)]
 struct Scene {
     camera: PinholeCamera,
@@ -32,7 +32,7 @@ struct PoseRecord {
     translation: [f64; 3],
 }
 
-/// A model, or the gradient of one; rows as in [`Gaussians64`].
+/// A model or its gradient; rows as in [`Gaussians64`].
 #[derive(Deserialize)]
 struct ModelRecord {
     means: Vec<[f64; 3]>,
@@ -42,7 +42,7 @@ struct ModelRecord {
     sh_coeffs: Vec<[f64; 3]>,
 }
 
-/// Splats, or the gradients of them, by Gaussian; `None` where a Gaussian is behind the camera or too near.
+/// Splats or their gradients, by Gaussian; `None` where a Gaussian is behind the camera or too near.
 #[derive(Deserialize)]
 struct SplatRecord {
     mean2d: Vec<Option<[f64; 2]>>,
@@ -50,7 +50,7 @@ struct SplatRecord {
     rgb: Vec<Option<[f64; 3]>>,
     opacity: Vec<Option<f64>>,
     range: Vec<Option<f64>>,
-    /// Not in gradients: depth only orders.
+    /// Missing in gradients, because depth only decides the order.
     #[serde(default)]
     depth: Vec<Option<f64>>,
 }
@@ -62,7 +62,7 @@ struct RasterRecord {
     range: Vec<f64>,
 }
 
-/// What happened in a scene, as the script counted it.
+/// How often each edge case occurred in a scene, as counted by the script.
 #[derive(Deserialize)]
 struct Counts {
     capped_pairs: u32,
@@ -73,7 +73,7 @@ struct Counts {
     black_channels: u32,
 }
 
-/// A recorded scene and what the twins make of it.
+/// A recorded scene and the results of the twins.
 struct Case {
     name: &'static str,
     theirs: Scene,
@@ -105,7 +105,8 @@ impl Case {
         Self { name, theirs, splats, raster, v_splats, v_model }
     }
 
-    /// Compares one number (or array) of the splats, by those Gaussians that both draw.
+    /// Compares one number (or array) of the splats for all Gaussians that we draw; gsplat must draw them
+    /// too.
     fn assert_splats<const N: usize>(
         &self,
         what: &str,
@@ -116,7 +117,9 @@ impl Case {
         for (i, splat) in self.splats.iter().enumerate() {
             if let Some(splat) = splat {
                 a.push(ours(splat, &self.v_splats[i]));
-                b.push(theirs[i].unwrap_or_else(|| panic!("{}: only we draw Gaussian {i}", self.name)));
+                b.push(theirs[i].unwrap_or_else(|| {
+                    panic!("{}: gsplat does not draw Gaussian {i}, but we do", self.name)
+                }));
             }
         }
         assert_rows_close(&format!("{}, {what}", self.name), &a, &b);
@@ -159,7 +162,7 @@ fn single(values: &[Option<f64>]) -> Vec<Option<[f64; 1]>> {
 }
 
 #[test]
-fn the_scenes_show_every_edge_and_one_has_gsplats_own_cap_of_alpha() {
+fn scenes_show_every_edge_and_one_has_gsplats_cap_of_alpha() {
     type Count = (&'static str, fn(&Counts) -> u32);
     let cases = cases();
     for case in &cases {
@@ -173,7 +176,7 @@ fn the_scenes_show_every_edge_and_one_has_gsplats_own_cap_of_alpha() {
         ("ratios that are clamped in the Jacobian", |c| c.clamped_ratios),
         ("Gaussians behind the camera or too near", |c| c.behind_or_near),
         ("Gaussians under 1/255", |c| c.transparent),
-        ("channels that are clamped at black", |c| c.black_channels),
+        ("channels that are clamped at 0", |c| c.black_channels),
     ];
     for (what, count) in counts {
         assert!(shows.iter().map(count).sum::<u32>() > 0, "{what}");
@@ -181,7 +184,7 @@ fn the_scenes_show_every_edge_and_one_has_gsplats_own_cap_of_alpha() {
 }
 
 #[test]
-fn what_is_behind_too_near_or_transparent_is_culled_and_nothing_else() {
+fn only_gaussians_behind_too_near_or_transparent_are_culled() {
     for case in cases() {
         for (i, splat) in case.splats.iter().enumerate() {
             let drawn = case.theirs.splats.opacity[i].is_some_and(|opacity| opacity >= 1.0 / 255.0);
@@ -191,21 +194,21 @@ fn what_is_behind_too_near_or_transparent_is_culled_and_nothing_else() {
 }
 
 #[test]
-fn projected_centres_are_gsplats() {
+fn projected_centres_match_gsplat() {
     for case in cases() {
         case.assert_splats("centre", &case.theirs.splats.mean2d, |splat, _| splat.mean2d);
     }
 }
 
 #[test]
-fn conics_are_gsplats() {
+fn conics_match_gsplat() {
     for case in cases() {
         case.assert_splats("conic", &case.theirs.splats.conic, |splat, _| splat.conic);
     }
 }
 
 #[test]
-fn depths_and_ranges_are_gsplats() {
+fn depths_and_ranges_match_gsplat() {
     for case in cases() {
         case.assert_splats("depth", &single(&case.theirs.splats.depth), |splat, _| [splat.depth]);
         case.assert_splats("range", &single(&case.theirs.splats.range), |splat, _| [splat.range]);
@@ -213,7 +216,7 @@ fn depths_and_ranges_are_gsplats() {
 }
 
 #[test]
-fn opacities_and_colours_are_gsplats() {
+fn opacities_and_colours_match_gsplat() {
     for case in cases() {
         case.assert_splats("opacity", &single(&case.theirs.splats.opacity), |splat, _| [splat.opacity]);
         case.assert_splats("colour", &case.theirs.splats.rgb, |splat, _| splat.rgb);
@@ -221,14 +224,14 @@ fn opacities_and_colours_are_gsplats() {
 }
 
 #[test]
-fn rendered_colours_are_gsplats() {
+fn rendered_colours_match_gsplat() {
     for case in cases() {
         assert_rows_close(&case.what("colour"), &case.raster.rgb, &case.theirs.raster.rgb);
     }
 }
 
 #[test]
-fn rendered_alphas_and_ranges_are_gsplats() {
+fn rendered_alphas_and_ranges_match_gsplat() {
     for case in cases() {
         assert_close(&case.what("alpha"), &case.raster.alpha, &case.theirs.raster.alpha);
         assert_close(&case.what("range"), &case.raster.range, &case.theirs.raster.range);
@@ -236,7 +239,7 @@ fn rendered_alphas_and_ranges_are_gsplats() {
 }
 
 #[test]
-fn gradients_of_splats_are_those_of_autograd() {
+fn gradients_of_splats_match_autograd() {
     for case in cases() {
         let theirs = &case.theirs.v_splats;
         case.assert_splats("gradient of conic", &theirs.conic, |_, v| v.conic);
@@ -247,28 +250,28 @@ fn gradients_of_splats_are_those_of_autograd() {
 }
 
 #[test]
-fn gradients_of_projected_centres_are_those_of_autograd() {
+fn gradients_of_projected_centres_match_autograd() {
     for case in cases() {
         case.assert_splats("gradient of centre", &case.theirs.v_splats.mean2d, |_, v| v.mean2d);
     }
 }
 
 #[test]
-fn gradients_of_means_are_those_of_autograd() {
+fn gradients_of_means_match_autograd() {
     for case in cases() {
         assert_rows_close(&case.what("means"), &case.v_model.means, &case.theirs.v_model.means);
     }
 }
 
 #[test]
-fn gradients_of_quaternions_are_those_of_autograd() {
+fn gradients_of_quaternions_match_autograd() {
     for case in cases() {
         assert_rows_close(&case.what("quaternions"), &case.v_model.quats, &case.theirs.v_model.quats);
     }
 }
 
 #[test]
-fn gradients_of_log_scales_are_those_of_autograd() {
+fn gradients_of_log_scales_match_autograd() {
     for case in cases() {
         assert_rows_close(
             &case.what("log scales"),
@@ -279,7 +282,7 @@ fn gradients_of_log_scales_are_those_of_autograd() {
 }
 
 #[test]
-fn gradients_of_opacity_logits_are_those_of_autograd() {
+fn gradients_of_opacity_logits_match_autograd() {
     for case in cases() {
         let theirs = &case.theirs.v_model.opacity_logits;
         assert_close(&case.what("opacity logits"), &case.v_model.opacity_logits, theirs);
@@ -287,7 +290,7 @@ fn gradients_of_opacity_logits_are_those_of_autograd() {
 }
 
 #[test]
-fn gradients_of_sh_coefficients_are_those_of_autograd() {
+fn gradients_of_sh_coefficients_match_autograd() {
     for case in cases() {
         let theirs = &case.theirs.v_model.sh_coeffs;
         assert_rows_close(&case.what("SH coefficients"), &case.v_model.sh_coeffs, theirs);

@@ -1,18 +1,18 @@
-//! Adam (Kingma and Ba 2015), on the Gaussians that a view sees.
+//! Adam (Kingma and Ba 2015) for the Gaussians that a view sees.
 //!
-//! A Gaussian outside the view keeps its parameters, its moments and its step count, so its bias
-//! correction counts the updates that it has had (the dense variant decays moments of what nobody saw).
-//! eps is 1e-15 as in 3DGS: gradients here are means over an image and small.
+//! A Gaussian outside the view keeps its parameters, its moments and its step count, so its bias correction
+//! counts its own updates. The dense variant also decays the moments of unseen Gaussians. eps is 1e-15 as in
+//! 3DGS, because gradients are means over an image and small.
 
 use super::Gaussians64;
 
-/// Decay of the first moment. Shorter than the usual 0.9: see [`BETA_2`].
+/// Decay of the first moment. Lower than the usual 0.9: see [`BETA_2`].
 pub const BETA_1: f64 = 0.8;
-/// Decay of the second moment. The usual 0.999 remembers a thousand updates, and a Gaussian that is updated
-/// only when it is seen has a few hundred in a whole run: the large gradients of the first ones would hold
-/// its steps down to the end.
+/// Decay of the second moment. The usual 0.999 averages over a thousand updates. A Gaussian that is only
+/// updated when it is seen has a few hundred in a whole run. The large gradients of its first updates would
+/// keep its steps small until the end.
 pub const BETA_2: f64 = 0.99;
-/// Keeps a parameter without gradient from 0 / 0.
+/// Avoids 0 / 0 for a parameter without gradient.
 pub const EPSILON: f64 = 1e-15;
 
 /// Learning rate of each kind of parameter at one iteration.
@@ -33,9 +33,9 @@ pub struct LearningRates {
 }
 
 impl LearningRates {
-    /// The rates of a view, scaled by [`lr_scale`]. Those of scales and of the higher bands stay as they are:
-    /// short runs want them so large that one visit may not do more. The fewer views see a Gaussian, the more
-    /// they would take its colour apart by direction (bench/history.jsonl).
+    /// The rates of a view, scaled by [`lr_scale`]. Scales and higher bands keep their rates. Short runs set
+    /// these so high that a larger step per view would do harm. Larger rates of higher bands would make the
+    /// colour of a Gaussian that few views see depend too much on direction (bench/history.jsonl).
     pub fn scaled(&self, lr_scale: f64) -> Self {
         Self {
             means: lr_scale * self.means,
@@ -67,12 +67,12 @@ pub struct AdamState {
     pub first: Gaussians64,
     /// Second moments.
     pub second: Gaussians64,
-    /// Updates that each Gaussian has had.
+    /// Number of updates of each Gaussian.
     pub steps: Vec<u32>,
 }
 
 impl AdamState {
-    /// Before the first update of `count` Gaussians.
+    /// The state before the first update of `count` Gaussians.
     pub fn new(count: usize, sh_degree: u8) -> Self {
         let zeros = Gaussians64::zeros(count, sh_degree);
         Self { first: zeros.clone(), second: zeros, steps: vec![0; count] }
@@ -82,11 +82,11 @@ impl AdamState {
 /// Largest factor on the rates of a view that sees little of the model.
 pub const MAX_LR_SCALE: f64 = 8.0;
 
-/// The factor on the rates of a view that sees `seen` of `trainable` Gaussians: 1 / sqrt(p), p the share that
-/// it sees.
+/// The factor on the rates of a view that sees `seen` of `trainable` Gaussians: 1 / sqrt(p), where p is the
+/// visible share.
 ///
-/// Where Adam acts on all Gaussians in every iteration, the second moment of one that a share p of the views
-/// sees averages zeros too, so its steps are that much larger for each view that sees it.
+/// Dense Adam updates all Gaussians in every iteration. If a share p of the views sees a Gaussian, its second
+/// moment also averages zeros. Its steps are larger by this factor in each view that sees it.
 pub fn lr_scale(trainable: usize, seen: usize) -> f64 {
     (trainable as f64 / seen.max(1) as f64).sqrt().min(MAX_LR_SCALE)
 }
@@ -114,11 +114,12 @@ pub fn adam(
     }
 }
 
-/// The same with one second moment a channel, that of coefficient 0, for all coefficients of the channel.
+/// The same with one second moment per colour channel: all coefficients of a channel use that of coefficient
+/// 0.
 ///
-/// The gradient of coefficient k is `basis_k(direction)` times that of the channel's colour, and the squares
-/// of the functions of band l add up to (2l + 1) / 4 pi in every direction: the mean square over a band is
-/// that of coefficient 0 in all bands.
+/// The gradient of coefficient k is `basis_k(direction)` times the gradient of the channel's colour. In every
+/// direction, the squares of the functions of band l add up to (2l + 1) / 4 pi. So the mean square over each
+/// band equals that of coefficient 0.
 pub fn adam_compact(
     model: &mut Gaussians64,
     v_model: &Gaussians64,
@@ -144,12 +145,12 @@ pub fn adam_compact(
     }
 }
 
-/// One number: `step` counts from 1 and includes this update.
+/// Updates one number; `step` counts from 1 and includes this update.
 pub fn adam_update(value: &mut f64, gradient: f64, first: &mut f64, second: &mut f64, step: u32, rate: f64) {
     adam_update_with(value, gradient, (first, second), step, rate, [BETA_1, BETA_2]);
 }
 
-/// The same with other memories than those of the Gaussians.
+/// The same with other decay rates than those of the Gaussians.
 pub fn adam_update_with(
     value: &mut f64,
     gradient: f64,
@@ -183,7 +184,7 @@ mod tests {
     };
 
     #[test]
-    fn three_updates_are_those_worked_out_by_hand() {
+    fn three_updates_match_those_worked_out_by_hand() {
         // Gradients 1, -2, 0.5 at rate 0.1:
         //   m  0.2      -0.24         -0.092
         //   v  0.01      0.0499        0.051901
@@ -205,7 +206,7 @@ mod tests {
     }
 
     #[test]
-    fn coefficients_share_the_second_moment_of_their_channel_and_the_rest_is_adam() {
+    fn compact_adam_shares_one_second_moment_per_colour_channel() {
         let (mut own, mut shared) = (Gaussians64::zeros(1, 1), Gaussians64::zeros(1, 1));
         let (mut own_state, mut state) = (AdamState::new(1, 1), AdamState::new(1, 1));
         for step in 1..=4 {
@@ -221,7 +222,7 @@ mod tests {
             if parameter < 14 {
                 assert_eq!(a, b, "{}", Gaussians64::parameter_name(parameter));
             } else {
-                // The same first moments, divided by another second one.
+                // The same first moments, divided by another second moment.
                 assert_ne!(a, b, "{}", Gaussians64::parameter_name(parameter));
                 assert_eq!(own_state.first.parameter(0, parameter), state.first.parameter(0, parameter));
             }
@@ -236,7 +237,7 @@ mod tests {
     }
 
     #[test]
-    fn each_parameter_moves_by_its_own_rate_and_only_where_the_view_sees_it() {
+    fn each_parameter_moves_by_its_rate_where_the_view_sees_it() {
         let mut model = Gaussians64::zeros(3, 1);
         let mut v_model = Gaussians64::zeros(3, 1);
         for index in 0..3 {
@@ -249,7 +250,7 @@ mod tests {
         adam(&mut model, &v_model, &mut state, &[true, false, false], &RATES);
         assert_eq!(state.steps, [2, 0, 1]);
         for parameter in 0..model.parameters() {
-            // A constant gradient moves by the rate at every step, whatever its size.
+            // A constant gradient of any size moves the parameter by its rate at every step.
             let rate = RATES.of_parameter(parameter);
             for (index, updates) in [(0, 2.0), (1, 0.0), (2, 1.0)] {
                 let value = model.parameter(index, parameter);

@@ -1,7 +1,8 @@
-//! A renderer without tiles, lists or boxes, written apart from the twins: per pixel over all Gaussians.
+//! A renderer without tiles, lists or boxes, independent of the twins: it loops over all Gaussians for each
+//! pixel.
 //!
-//! It takes other ways to the same numbers: glam's quaternions and inverses instead of written-out ones,
-//! the colour as the caller's closure, the weights from the definition. Only tests use it.
+//! It computes the same numbers in other ways: glam's quaternions and inverses instead of written-out ones,
+//! the colour from the caller's closure, the weights from the definition. Only tests use it.
 
 use glam::{DMat2, DMat3, DQuat, DVec2, DVec3};
 

@@ -1,4 +1,4 @@
-//! The whole way of one view: Gaussians -> image -> loss -> gradient of every parameter.
+//! All stages of one view: Gaussians -> image -> loss -> gradient of every parameter.
 
 use super::{
     Gaussians64, Loss, Raster, RasterGradients, RasterRules, Splat, SplatGradient, TileLists, intersect,
@@ -6,14 +6,14 @@ use super::{
 };
 use fathom_core::scene::{PinholeCamera, Pose};
 
-/// What one view is trained on.
+/// The inputs of training on one view.
 #[derive(Clone, Debug)]
 pub struct ViewInput<'a> {
     /// Pinhole camera.
     pub camera: &'a PinholeCamera,
     /// World to camera.
     pub pose: &'a Pose,
-    /// Degree of the schedule.
+    /// SH degree that the schedule has reached.
     pub sh_degree: u8,
     /// Colour behind everything.
     pub background: [f64; 3],
@@ -57,7 +57,7 @@ pub fn render(
     (splats, lists, raster)
 }
 
-/// Loss of `model` on one view and its gradient by every parameter, without the regularisers.
+/// Loss of `model` on one view and its gradient with respect to every parameter, without the regularisers.
 pub fn view_gradients(model: &Gaussians64, view: &ViewInput<'_>, rules: &RasterRules) -> ViewGradients {
     let (camera, pose) = (view.camera, view.pose);
     let (splats, lists, raster) = render(model, camera, pose, view.sh_degree, view.background, rules);
@@ -90,7 +90,7 @@ mod tests {
     }
 
     #[test]
-    fn the_tiled_renderer_gives_what_a_renderer_without_tiles_gives() {
+    fn the_tiled_renderer_matches_one_without_tiles() {
         for (width, height) in [(75, 53), (16, 16), (17, 1), (1, 33)] {
             let (camera, pose) = off_centre_view(width, height, 3.0);
             for rules in [RasterRules::HARD, RasterRules::SMOOTH] {
@@ -103,7 +103,7 @@ mod tests {
                     };
                     let pixels = brute_force(&model, &camera, &pose, BACKGROUND.into(), &rules, colour);
                     for (i, pixel) in pixels.iter().enumerate() {
-                        // Sums of 60 numbers near 1, covariances of needles with condition numbers of 1e4.
+                        // Sums of 60 numbers near 1; covariances of needles have condition numbers of 1e4.
                         let close = |a: f64, b: f64| (a - b).abs() < 1e-10;
                         assert!(
                             (0..3).all(|c| close(raster.rgb[i][c], pixel.rgb[c]))
@@ -121,7 +121,7 @@ mod tests {
     }
 
     #[test]
-    fn the_gradient_of_the_loss_is_its_central_difference_for_every_parameter() {
+    fn every_gradient_of_the_loss_is_its_central_difference() {
         let (width, height) = (21, 18);
         let (camera, pose) = off_centre_view(width, height, 3.0);
         let (truth, mask) = photograph(width * height);
@@ -152,7 +152,7 @@ mod tests {
                         });
                         let parameter_name = Gaussians64::parameter_name(parameter);
                         let what = format!("{name}, degree {sh_degree}, {parameter_name} of Gaussian {id}");
-                        // The loss is near 0.4: rounding is 1e-12, and 1e-4 RELATIVE is a hundred times that.
+                        // The loss is near 0.4, so rounding is 1e-12; 1e-4 RELATIVE is a hundred times that.
                         assert_close(&what, result.v_model.parameter(id, parameter), numeric, 1e-4);
                     }
                 }
@@ -206,8 +206,8 @@ mod tests {
 
     #[test]
     fn a_wall_in_front_ends_a_pixel() {
-        // The first wall leaves 0.01, the second would leave 1e-4 and rounding decides whether that is less
-        // than the least allowed; the third would leave 1e-6 and never enters.
+        // The first wall leaves 0.01. The second would leave 1e-4, and rounding decides whether that is below
+        // the limit. The third would leave 1e-6 and is never blended.
         let (camera, pose) = off_centre_view(16, 16, 3.0);
         let mut model = Gaussians64::zeros(4, 0);
         for (i, mean) in model.means.iter_mut().enumerate() {

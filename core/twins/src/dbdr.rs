@@ -1,20 +1,21 @@
-//! Water whose coefficients follow from the range of a pixel (DBDR, SMP-UWGS eq. 9), its backward, and Adam
-//! on its four numbers.
+//! Water whose coefficients depend on the range of a pixel (DBDR, SMP-UWGS eq. 9), its backward pass, and
+//! Adam on its four parameters.
 
 use super::{Blended, adam_update_with, form, form_backward};
 use fathom_core::config::{Blend, Medium};
 use fathom_core::water::{LEAST_ALPHA, RangeModulation, Water};
 
-/// A pixel under water, linear light: as `form` where the water acts on pixels, with the water as it is at
-/// its range.
+/// A pixel under water, in linear light: `form` for water on pixels, with the coefficients at the range of
+/// the pixel.
 pub fn form_refined(water: &Water, refinement: &RangeModulation, blend: Blend, pixel: &Blended) -> [f64; 3] {
     let here =
         if pixel.alpha < LEAST_ALPHA { *water } else { refinement.at(water, pixel.range / pixel.alpha) };
     form(&here, Medium::PerPixel, blend, pixel)
 }
 
-/// Backward of [`form_refined`]: gradient by the pixel, given that by what is formed; adds to `v_water` and
-/// to `v_refinement`, in the order of [`RangeModulation::to_array`].
+/// Backward pass of [`form_refined`]: returns the gradient with respect to the pixel, from the gradient `v`
+/// with respect to the formed colour. Adds to `v_water` and to `v_refinement`, in the order of
+/// [`RangeModulation::to_array`].
 pub fn form_refined_backward(
     water: &Water,
     refinement: &RangeModulation,
@@ -40,7 +41,7 @@ pub fn form_refined_backward(
             v_water[i] += factors[k] * v_here[i];
             v_factor += values[i] * v_here[i];
         }
-        // Of scale * sigmoid: m (1 - m / scale).
+        // The derivative of m = scale * sigmoid(x) is m (1 - m / scale).
         let v_x = v_factor * factors[k] * (1.0 - factors[k] / refinement.scale);
         v_refinement[2 * k] += v_x * z;
         v_refinement[2 * k + 1] += v_x;
@@ -57,7 +58,7 @@ pub fn form_refined_backward(
 /// The weights and biases of eq. 9 with Adam's state.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RefinementState {
-    /// As it is now.
+    /// The current parameters.
     pub refinement: RangeModulation,
     first: [f64; 4],
     second: [f64; 4],
@@ -65,12 +66,13 @@ pub struct RefinementState {
 }
 
 impl RefinementState {
-    /// At `refinement`.
+    /// Starts at `refinement`.
     pub fn new(refinement: RangeModulation) -> Self {
         Self { refinement, first: [0.0; 4], second: [0.0; 4], steps: 0 }
     }
 
-    /// One step of Adam (memories 0.9 and 0.999) on the gradient by [`RangeModulation::to_array`].
+    /// Takes one step of Adam (decay 0.9 and 0.999) with the gradient in the order of
+    /// [`RangeModulation::to_array`].
     pub fn step(&mut self, v: &[f64; 4], rate: f64) {
         self.steps += 1;
         let mut values = self.refinement.to_array();
@@ -96,7 +98,7 @@ mod tests {
     }
 
     #[test]
-    fn gradients_through_a_water_that_follows_from_range_are_central_differences() {
+    fn gradients_through_dbdr_are_central_differences() {
         for i in 0..30 {
             let blend = [Blend::Srgb, Blend::Linear, Blend::OverBlack][(i % 3) as usize];
             let four = std::array::from_fn(|k| 2.0 * number(i, 20 + k as u32) - 1.0);
@@ -155,7 +157,7 @@ mod tests {
     }
 
     #[test]
-    fn the_identity_forms_what_the_nine_numbers_form_and_open_water_stays() {
+    fn the_identity_equals_constant_water_and_keeps_open_water() {
         let identity = RangeModulation::identity(2.0, 3.2);
         let pixel = Blended { rgb: [0.3, 0.2, 0.1], alpha: 0.7, range: 4.0 };
         let plain = form(&WATER, Medium::PerPixel, Blend::Linear, &pixel);

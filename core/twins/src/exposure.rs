@@ -1,8 +1,9 @@
-//! Exposure of a training view: colour' = A colour + b before the loss, its backward, and Adam on all views'
-//! maps.
+//! Exposure of a training view: colour' = A colour + b before the loss, its backward pass, and Adam on the
+//! maps of all views.
 //!
-//! As in 3DGS since October 2024. One departure: a step of one view is taken back from all in equal parts, so
-//! that the mean of all exposures stays the identity (`core/src/appearance/exposure/device.rs` says why).
+//! As in 3DGS since October 2024, with one difference: each step of a view is subtracted from all views in
+//! equal parts. The mean of all exposures therefore stays the identity
+//! (`core/src/appearance/exposure/device.rs` explains why).
 
 use super::adam_update;
 
@@ -12,12 +13,13 @@ pub type Exposure = [[f64; 4]; 3];
 /// The map that changes nothing.
 pub const IDENTITY: Exposure = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]];
 
-/// `exposure` applied to every pixel.
+/// Applies `exposure` to every pixel.
 pub fn expose(rgb: &[[f64; 3]], exposure: &Exposure) -> Vec<[f64; 3]> {
     rgb.iter().map(|&[r, g, b]| exposure.map(|row| row[0] * r + row[1] * g + row[2] * b + row[3])).collect()
 }
 
-/// Gradients by the colours and by the exposure, given that by the exposed colours.
+/// Gradients with respect to the colours and the exposure, from the gradient with respect to the exposed
+/// colours.
 pub fn expose_backward(
     rgb: &[[f64; 3]],
     v_exposed: &[[f64; 3]],
@@ -36,10 +38,10 @@ pub fn expose_backward(
     (v_rgb, v_exposure)
 }
 
-/// Exposures of all views of a run with Adam's state.
+/// Exposures of all views of a run, with Adam's state.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ExposureState {
-    /// One a view; their mean is the identity.
+    /// One per view; their mean is the identity.
     pub exposures: Vec<Exposure>,
     first: Vec<Exposure>,
     second: Vec<Exposure>,
@@ -53,7 +55,7 @@ impl ExposureState {
         Self { exposures: vec![IDENTITY; views], first: zeros.clone(), second: zeros, steps: vec![0; views] }
     }
 
-    /// One step of Adam on `view`, taken back from all views in equal parts.
+    /// Takes one step of Adam on `view` and subtracts it from all views in equal parts.
     pub fn step(&mut self, view: usize, v_exposure: &Exposure, rate: f64) {
         self.steps[view] += 1;
         let share = 1.0 / self.exposures.len() as f64;
@@ -94,7 +96,7 @@ mod tests {
     }
 
     #[test]
-    fn gradients_by_colours_and_exposure_are_the_central_differences_of_the_loss() {
+    fn gradients_by_colours_and_exposure_are_central_differences() {
         let (rgb, truth, exposure) = (picture(61), picture(62), some_exposure(63));
         let mask: Vec<bool> = (0..rgb.len()).map(|i| i % 5 != 0).collect();
         let of = |rgb: &[[f64; 3]], exposure: &Exposure| {
@@ -103,7 +105,7 @@ mod tests {
         let (v_rgb, v_exposure) = expose_backward(&rgb, &of(&rgb, &exposure).v_rgb, &exposure);
         for row in 0..3 {
             for column in 0..4 {
-                // |x - y| has no derivative where it changes its sign, so the step is small.
+                // |x - y| has no derivative where x - y changes its sign, so the step is small.
                 let numeric = 1e3
                     * derivative(|h| {
                         let mut moved = exposure;
@@ -138,7 +140,12 @@ mod tests {
             }
         }
         let gain = |view: usize| state.exposures[view][0][0];
-        assert!(gain(3) < gain(1) - 0.01, "a gradient above 0 lowers: {} and {}", gain(3), gain(1));
+        assert!(
+            gain(3) < gain(1) - 0.01,
+            "a positive gradient must lower the gain: {} and {}",
+            gain(3),
+            gain(1)
+        );
         assert_eq!(state.steps, [2, 1, 1, 3, 1]);
     }
 

@@ -1,8 +1,8 @@
-//! View embeddings (FiLM, SMP-UWGS eq. 10): factors on the colours of a training view by the mean colours of
-//! its cells, their backward, and Adam on the weights and on all views' embeddings.
+//! View embeddings (FiLM, SMP-UWGS eq. 10): factors on the colours of a training view, from the mean colours
+//! of its cells. Also their backward pass, and Adam on the weights and the embeddings of all views.
 //!
-//! A step of one view's embedding is taken back from all in equal parts, so that their mean stays 0, which is
-//! the identity (`core/src/appearance/film/device.rs` says why).
+//! Each step of an embedding is subtracted from all embeddings in equal parts. Their mean stays 0, which is
+//! the identity (`core/src/appearance/film/device.rs` explains why).
 
 use super::adam_update_with;
 
@@ -14,7 +14,7 @@ pub const BOUND: f64 = 0.5;
 /// Scale and shift of each hidden unit.
 pub type Embedding = [[f64; 2]; UNITS];
 
-/// Of each unit: weights of the mean colour and bias; weights of the three outputs.
+/// Per unit: weights of the mean colour, bias, and weights of the three outputs.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FilmWeights {
     /// `[units][r, g, b, 1]`.
@@ -30,27 +30,27 @@ pub struct FilmPicture<'a> {
     pub rgb: &'a [[f64; 3]],
     /// Width and height, pixels.
     pub size: [u32; 2],
-    /// In how many parts the sides are cut.
+    /// Number of cells across and down.
     pub cells: [u32; 2],
 }
 
 /// Gradients of [`film`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct FilmGradients {
-    /// By the picture.
+    /// With respect to the picture.
     pub rgb: Vec<[f64; 3]>,
-    /// By the weights.
+    /// With respect to the weights.
     pub weights: FilmWeights,
-    /// By the embedding of the view.
+    /// With respect to the embedding of the view.
     pub embedding: Embedding,
 }
 
-/// The part of a side that pixel `x` lies in, of parts that begin at `i side / count`, rounded down.
+/// The part of a side that contains pixel `x`; part i begins at `i side / count`, rounded down.
 fn part_of(x: u32, count: u32, side: u32) -> u32 {
     ((x + 1) * count - 1) / side
 }
 
-/// The two parts between whose centres pixel `x` lies, with their shares.
+/// The two parts whose centres surround pixel `x`, with their shares.
 fn between(x: u32, count: u32, side: u32) -> [(u32, f64); 2] {
     let at =
         ((f64::from(x) + 0.5) * f64::from(count) / f64::from(side) - 0.5).clamp(0.0, f64::from(count - 1));
@@ -71,7 +71,7 @@ impl FilmPicture<'_> {
         (row * self.cells[0] + column) as usize
     }
 
-    /// The cells that a pixel has its factors from, with their shares.
+    /// The cells whose factors a pixel interpolates, with their shares.
     fn shares(&self, x: u32, y: u32) -> impl Iterator<Item = (usize, f64)> + use<> {
         let across = between(x, self.cells[0], self.size[0]);
         let columns = self.cells[0];
@@ -94,7 +94,7 @@ impl FilmPicture<'_> {
     }
 }
 
-/// Before and after modulation: `a` and `s` of a unit.
+/// A unit before and after modulation: `a` and `s`.
 fn unit(weights: &FilmWeights, embedding: &Embedding, j: usize, mean: [f64; 3]) -> (f64, f64) {
     let row = weights.first[j];
     let plain = row[0] * mean[0] + row[1] * mean[1] + row[2] * mean[2] + row[3];
@@ -112,7 +112,7 @@ fn map(weights: &FilmWeights, embedding: &Embedding, mean: [f64; 3]) -> [f64; 3]
     outputs.map(|o| (BOUND * (o / BOUND).tanh()).exp())
 }
 
-/// The picture with the factors of a view's embedding.
+/// Applies the factors of a view's embedding to the picture.
 pub fn film(picture: &FilmPicture<'_>, weights: &FilmWeights, embedding: &Embedding) -> Vec<[f64; 3]> {
     let maps: Vec<[f64; 3]> =
         picture.means().iter().map(|(mean, _)| map(weights, embedding, *mean)).collect();
@@ -125,7 +125,7 @@ pub fn film(picture: &FilmPicture<'_>, weights: &FilmWeights, embedding: &Embedd
     filmed
 }
 
-/// Backward of [`film`], given the gradient by what it gives.
+/// Backward pass of [`film`], from the gradient with respect to its result.
 pub fn film_backward(
     picture: &FilmPicture<'_>,
     weights: &FilmWeights,
@@ -178,12 +178,12 @@ pub fn film_backward(
     FilmGradients { rgb: v_rgb, weights: v_weights, embedding: v_embedding }
 }
 
-/// Weights and embeddings of a run with Adam's state.
+/// Weights and embeddings of a run, with Adam's state.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FilmState {
-    /// What all views share.
+    /// Weights that all views share.
     pub weights: FilmWeights,
-    /// One a view; their mean is 0.
+    /// One per view; their mean is 0.
     pub embeddings: Vec<Embedding>,
     weight_moments: [[[f64; 2]; 7]; UNITS],
     view_moments: Vec<[[[f64; 2]; 2]; UNITS]>,
@@ -192,7 +192,7 @@ pub struct FilmState {
 }
 
 impl FilmState {
-    /// No embedding for each of `views` views.
+    /// Zero embeddings for `views` views.
     pub fn new(weights: FilmWeights, views: usize) -> Self {
         Self {
             weights,
@@ -204,8 +204,8 @@ impl FilmState {
         }
     }
 
-    /// One step of Adam on the weights (memories 0.9 and 0.999) and on the embedding of `view` (0.8 and 0.99,
-    /// as those of exposures), the latter taken back from all views in equal parts.
+    /// Takes one step of Adam on the weights (decay 0.9 and 0.999) and on the embedding of `view` (0.8 and
+    /// 0.99, as for exposures). The step of the embedding is subtracted from all views in equal parts.
     pub fn step(&mut self, view: usize, v: &FilmGradients, rate: f64, view_rate: f64) {
         self.steps += 1;
         self.view_steps[view] += 1;
@@ -256,7 +256,7 @@ mod tests {
     }
 
     #[test]
-    fn parts_cover_a_side_evenly_and_shares_of_a_pixel_add_up_to_one() {
+    fn parts_cover_a_side_evenly_and_pixel_shares_sum_to_one() {
         for (count, side) in [(1, 1), (1, 50), (3, 100), (4, 7), (7, 7), (50, 1607)] {
             let parts: Vec<u32> = (0..side).map(|x| part_of(x, count, side)).collect();
             assert!(parts.is_sorted() && parts[0] == 0 && parts[side as usize - 1] == count - 1);
@@ -273,7 +273,7 @@ mod tests {
     }
 
     #[test]
-    fn gradients_by_picture_weights_and_embedding_are_central_differences() {
+    fn all_gradients_of_film_are_central_differences() {
         for (seed, size, cells) in [(501, [13, 7], [3, 2]), (502, [5, 4], [1, 1]), (503, [6, 9], [1, 4])] {
             let (rgb, weights, embedding) = (colours(seed, size), some_weights(seed), some_embedding(seed));
             let v: Vec<[f64; 3]> = colours(seed + 50, size).iter().map(|v| v.map(|v| v - 0.4)).collect();
@@ -282,7 +282,7 @@ mod tests {
                 filmed.iter().flatten().zip(v.iter().flatten()).map(|(x, v)| x * v).sum()
             };
             let by = film_backward(&FilmPicture { rgb: &rgb, size, cells }, &weights, &embedding, &v);
-            // Units must not be at their bend within the step of the differences.
+            // No unit may cross its bend within the step of the differences.
             for j in 0..UNITS {
                 for (k, found) in by.weights.first[j].iter().enumerate() {
                     let numeric = derivative(|h| {
@@ -323,7 +323,7 @@ mod tests {
     }
 
     #[test]
-    fn no_embedding_is_the_identity_whatever_the_weights_and_factors_are_bounded() {
+    fn a_zero_embedding_is_the_identity_and_factors_are_bounded() {
         let (rgb, size) = (colours(511, [9, 8]), [9, 8]);
         let picture = FilmPicture { rgb: &rgb, size, cells: [3, 2] };
         for (a, b) in
@@ -338,7 +338,7 @@ mod tests {
     }
 
     #[test]
-    fn embeddings_take_up_the_brightness_of_views_and_their_mean_stays_zero() {
+    fn embeddings_learn_brightness_and_their_mean_stays_zero() {
         let size = [24, 20];
         let rgb = colours(521, size);
         let picture = FilmPicture { rgb: &rgb, size, cells: [2, 2] };

@@ -1,8 +1,8 @@
-//! A model, or the gradient of one, in f64.
+//! A model or its gradient, in f64.
 
 use fathom_core::gaussians::Gaussians;
 
-/// [`Gaussians`] in f64; as a gradient, entry by entry the derivative of the loss.
+/// [`Gaussians`] in f64. As a gradient, each entry is the derivative of the loss.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Gaussians64 {
     /// Degree of the spherical harmonics that are stored, 0 to 3.
@@ -20,7 +20,7 @@ pub struct Gaussians64 {
 }
 
 impl Gaussians64 {
-    /// `count` Gaussians with every number 0: the start of a sum of gradients.
+    /// `count` Gaussians with all numbers 0: the start of a sum of gradients.
     pub fn zeros(count: usize, sh_degree: u8) -> Self {
         let coeffs = (usize::from(sh_degree) + 1).pow(2);
         Self {
@@ -48,7 +48,7 @@ impl Gaussians64 {
         (usize::from(self.sh_degree) + 1).pow(2)
     }
 
-    /// Numbers that make one Gaussian: 11 + 3 K.
+    /// Number of parameters of one Gaussian: 11 + 3 K.
     pub fn parameters(&self) -> usize {
         11 + 3 * self.coeffs()
     }
@@ -66,7 +66,7 @@ impl Gaussians64 {
         }
     }
 
-    /// The same, to be written.
+    /// The same, mutable.
     pub fn parameter_mut(&mut self, index: usize, parameter: usize) -> &mut f64 {
         let k = self.coeffs();
         match parameter {
@@ -78,7 +78,7 @@ impl Gaussians64 {
         }
     }
 
-    /// What [`Self::parameter`] calls a parameter, for messages.
+    /// Name of a parameter of [`Self::parameter`], for messages.
     pub fn parameter_name(parameter: usize) -> String {
         match parameter {
             0..3 => format!("mean[{parameter}]"),

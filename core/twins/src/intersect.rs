@@ -1,15 +1,15 @@
-//! Which splat touches which tile, and the order of splats in a tile.
+//! Finds the tiles that each splat touches, and the order of splats in a tile.
 //!
-//! A splat touches a tile when the least sigma over the tile's rectangle of pixel centres is at most the
-//! splat's extent: an exact test of ellipse against rectangle, so a needle across the image is in the
-//! tiles along it and not in all those of its box. The rectangle is the whole 16x16 tile also where the
-//! image ends inside it. In a tile: by depth, ties by the Gaussian's index.
+//! A splat touches a tile when its least sigma over the tile's rectangle of pixel centres is at most its
+//! extent. This is an exact test of ellipse against rectangle: a needle across the image touches the tiles
+//! along it, not all tiles of its box. The rectangle is the whole 16x16 tile even where the image ends inside
+//! it. Splats in a tile are sorted by depth, ties by the Gaussian's index.
 
 use std::cmp::Ordering;
 
 use super::{Splat, TILE};
 
-/// For every tile the Gaussians that touch it, front to back.
+/// The Gaussians that touch each tile, front to back.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct TileLists {
     /// Tiles across.
@@ -29,7 +29,7 @@ impl TileLists {
         &self.gaussian_ids[start as usize..end as usize]
     }
 
-    /// The number of tiles that each of `count` Gaussians touches; 0 means that the view does not see it.
+    /// The number of tiles that each of `count` Gaussians touches; 0 if the view does not see it.
     pub fn tiles_per_gaussian(&self, count: usize) -> Vec<u32> {
         let mut tiles = vec![0; count];
         for &id in &self.gaussian_ids {
@@ -74,8 +74,8 @@ pub fn intersect(splats: &[Option<Splat>], width: u32, height: u32) -> TileLists
 
 /// The least sigma of `splat` over the rectangle from `low` to `high`, pixels.
 ///
-/// sigma is convex with its minimum 0 at the centre: inside, that is it; outside, the minimum is on the
-/// rim, and on each side sigma is a parabola of one variable.
+/// sigma is convex, and its minimum is 0 at the centre. If the centre is outside the rectangle, the least
+/// sigma is on the rim. On each side of the rim, sigma is a parabola of one variable.
 pub fn min_sigma_in_rect(splat: &Splat, low: [f64; 2], high: [f64; 2]) -> f64 {
     let [a, b, c] = splat.conic;
     let [mx, my] = splat.mean2d;
@@ -105,7 +105,7 @@ fn tile_centres(tile_x: u32, tile_y: u32) -> ([f64; 2], [f64; 2]) {
     (low, [low[0] + side, low[1] + side])
 }
 
-/// Tiles that the box of `splat` touches on one axis; a box without end touches all of them.
+/// Tiles that the box of `splat` touches on one axis; an infinite box touches all of them.
 fn tile_span(splat: &Splat, axis: usize, tiles: u32) -> std::ops::Range<u32> {
     let (centre, half) = (splat.mean2d[axis], splat.half_size[axis]);
     let bound = |v: f64| (v / f64::from(TILE)).clamp(0.0, f64::from(tiles));
@@ -120,7 +120,7 @@ mod tests {
     use crate::{Gaussians64, RasterRules, project_forward};
 
     #[test]
-    fn the_least_sigma_of_a_tile_is_that_of_dense_sampling() {
+    fn the_least_sigma_of_a_tile_matches_dense_sampling() {
         const SAMPLES: u32 = 300;
         let (camera, pose) = off_centre_view(75, 53, 3.0);
         for (name, model) in all(11, 12, 0) {
@@ -139,9 +139,9 @@ mod tests {
                             sampled = sampled.min(0.5 * (a * x * x + c * y * y) + b * x * y);
                         }
                     }
-                    // The nearest sample is at most (step/2, step/2) away from the minimum. If that is
-                    // free, sigma rises by at most trace(conic) step^2 / 8; on the rim, the sample may lie
-                    // along the rim only, and the same bound holds for the parabola there.
+                    // The nearest sample is at most (step/2, step/2) away from the minimum. Inside the
+                    // rectangle, sigma rises by at most trace(conic) step^2 / 8. On the rim, the sample can
+                    // only move along the rim, where the same bound holds for the parabola.
                     let rise = (splat.conic[0] + splat.conic[2]) * step * step / 4.0;
                     let rounding = 1e-9 * exact.max(1.0);
                     let what = format!("{name} {id}, tile {tile_x} {tile_y}: {exact} against {sampled}");
@@ -172,7 +172,7 @@ mod tests {
                     }
                 }
             }
-            assert!(pairs > 1000, "{name}: {pairs} pairs only");
+            assert!(pairs > 1000, "{name}: only {pairs} pairs");
         }
     }
 
@@ -193,7 +193,8 @@ mod tests {
             half_size: [half, half],
         };
         let lists = intersect(&[Some(needle)], width, height);
-        // Half width sqrt(2 * 5) = 3.2 px: the ten tiles of the diagonal and the corners beside it.
+        // Half width sqrt(2 * 5) = 3.2 px, so it touches the ten tiles of the diagonal and the corners beside
+        // it.
         for tile_y in 0..10_u32 {
             for tile_x in 0..10_u32 {
                 let listed = !lists.of_tile(tile_x, tile_y).is_empty();

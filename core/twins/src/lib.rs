@@ -1,16 +1,16 @@
 //! The twins: every stage of the renderer and the trainer as plain f64 loops, forward and backward.
 //!
-//! A package of its own, for tests and examples: the program does not contain it.
+//! This is a separate package for tests and examples; the program does not contain it.
 //!
-//! They say what the kernels in `shaders/` compute, in the same order, and they are what the kernels are
-//! tested against; `shaders/README.md` says which twin belongs to which stage. Nothing here is fast and
-//! nothing here runs in a training job. The backwards are themselves tested against central differences, the
-//! tile-based rasteriser against a renderer without tiles, a render and the loss, forward and backward, also
-//! against other projects (`core/tests/peers`).
+//! The twins compute the same as the kernels in `shaders/`, in the same order, and the kernels are tested
+//! against them. `shaders/README.md` lists the twin of each kernel. Twins are slow and never run in a
+//! training job. Their backward passes are tested against central differences, and the tile-based rasteriser
+//! against a renderer without tiles. A render and the loss, forward and backward, are also tested against
+//! other projects (`core/tests/peers`).
 //!
-//! Conventions: camera x right, y down, z forward; pixels from the top left with centres at +0.5; arrays
-//! are row-major; `v_x` is the gradient of the loss with respect to `x`. One splat a Gaussian, at the
-//! Gaussian's own index, so that a stage can be fed with what a kernel gave for the stage before.
+//! Conventions: camera x right, y down, z forward; pixels from the top left with centres at +0.5; arrays are
+//! row-major. `v_x` is the gradient of the loss with respect to `x`. Each Gaussian has one splat at its own
+//! index, so the output of a kernel can be the input of the next twin.
 
 mod adam;
 #[cfg(test)]
@@ -65,23 +65,23 @@ pub const BLUR: f64 = 0.3;
 /// Side of a tile, pixels.
 pub const TILE: u32 = 16;
 
-/// The hard edges of blending, and what the low-pass does to opacity. Central differences need the edges
+/// The hard edges of blending, and the effect of the low-pass on opacity. Central differences need the edges
 /// switched off ([`RasterRules::SMOOTH`]).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RasterRules {
-    /// A contribution below this is skipped; it also bounds the ellipse. 1/255: half a step of 8 bits is
-    /// less.
+    /// A contribution below this is skipped; it also bounds the ellipse. 1/255: a smaller one changes an
+    /// 8-bit value by less than one step.
     pub min_alpha: f64,
-    /// A pixel stops before the contribution that would leave less than this: (1 - `max_alpha`)^2.
+    /// A pixel stops before a contribution that would leave less than this: (1 - `max_alpha`)^2.
     pub min_transmittance: f64,
-    /// Cap of one contribution, so that 1 - alpha can be divided by.
+    /// Cap of one contribution, so that dividing by 1 - alpha is safe.
     pub max_alpha: f64,
-    /// Whether opacity makes up for the low-pass: the 2D filter of Mip-Splatting (Yu et al. 2024, eq. 9).
+    /// Whether opacity compensates for the low-pass: the 2D filter of Mip-Splatting (Yu et al. 2024, eq. 9).
     pub mip_filter: bool,
 }
 
 impl RasterRules {
-    /// What the kernels do.
+    /// The rules of the kernels.
     pub const HARD: Self =
         Self { min_alpha: 1.0 / 255.0, min_transmittance: 1e-4, max_alpha: 0.99, mip_filter: false };
     /// No edge: every Gaussian reaches every pixel, and the image is a smooth function of the model

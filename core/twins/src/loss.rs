@@ -1,9 +1,9 @@
-//! (1 - w) L1 + w (1 - SSIM) of a render against its photograph, and the gradient to the render.
+//! (1 - w) L1 + w (1 - SSIM) of a render against its photograph, and the gradient with respect to the render.
 //!
-//! SSIM as in 3DGS: Gaussian window of 11 taps, sigma 1.5, zeros outside the image, C1 = 0.01^2,
-//! C2 = 0.03^2, per channel. L1 and SSIM are each the mean over pixels and channels. Where the mask
-//! ignores a pixel, render and photograph are 0 before the window, and |difference| and SSIM map are 0
-//! after it; the mean stays over all pixels, so a wholly ignored picture has the loss w and no gradient.
+//! SSIM as in 3DGS: Gaussian window of 11 taps, sigma 1.5, zeros outside the image, C1 = 0.01^2, C2 = 0.03^2,
+//! per channel. L1 and SSIM are each the mean over pixels and channels. At masked pixels, render and
+//! photograph are set to 0 before the window, and |difference| and the SSIM map are set to 0 after it. The
+//! mean is still over all pixels, so a wholly masked picture has the loss w and no gradient.
 
 use fathom_core::views::PackedImage;
 
@@ -22,7 +22,7 @@ pub struct Loss {
     pub l1: f64,
     /// Mean SSIM.
     pub ssim: f64,
-    /// Gradient of `total` by the render, `[H*W]`.
+    /// Gradient of `total` with respect to the render, `[H*W]`.
     pub v_rgb: Vec<[f64; 3]>,
 }
 
@@ -51,7 +51,7 @@ pub fn loss(
         };
         let (x, y) = (masked(render), masked(truth));
         let terms = Ssim::new(&x, &y, width, height);
-        // The mask stands in front of every derivative of the map, before they go back through the window.
+        // The mask applies to every derivative of the map before it goes back through the window.
         let masked_terms = |of: fn(&Ssim, usize) -> f64| -> Vec<f64> {
             (0..pixels).map(|i| if mask[i] { of(&terms, i) } else { 0.0 }).collect()
         };
@@ -76,7 +76,7 @@ pub fn ssim_map(x: &[f64], y: &[f64], width: u32, height: u32) -> Vec<f64> {
     (0..x.len()).map(|i| terms.value(i)).collect()
 }
 
-/// The five windowed means that SSIM is made of.
+/// The five windowed means of SSIM.
 struct Ssim {
     x: Vec<f64>,
     y: Vec<f64>,
@@ -113,20 +113,20 @@ impl Ssim {
         a * b / (c * d)
     }
 
-    /// Derivative of the map by the windowed mean of x, with the windowed mean of x^2 and xy held.
+    /// Derivative of the map with respect to the windowed mean of x, at fixed windowed means of x^2 and x y.
     fn by_mean(&self, i: usize) -> f64 {
         let (mx, my) = (self.x[i], self.y[i]);
         let (a, b, c, d) = self.parts(i);
         2.0 * my * (b - a) / (c * d) - a * b / (c * d) * 2.0 * mx * (1.0 / c - 1.0 / d)
     }
 
-    /// By the windowed mean of x^2.
+    /// With respect to the windowed mean of x^2.
     fn by_square(&self, i: usize) -> f64 {
         let (a, b, c, d) = self.parts(i);
         -a * b / (c * d * d)
     }
 
-    /// By the windowed mean of x y.
+    /// With respect to the windowed mean of x y.
     fn by_product(&self, i: usize) -> f64 {
         let (a, _, c, d) = self.parts(i);
         2.0 * a / (c * d)
@@ -142,8 +142,8 @@ fn window() -> [f64; SSIM_TAPS] {
     taps.map(|tap| tap / sum)
 }
 
-/// Convolves with the window along rows, then columns, with zeros outside. Symmetric, so it is its own
-/// backward.
+/// Convolves with the window along rows, then columns, with zeros outside. It is symmetric, so it is its own
+/// backward pass.
 fn blur(image: &[f64], width: usize, height: usize) -> Vec<f64> {
     let taps = window();
     let along = |image: &[f64], step: usize, place: fn(usize, usize) -> usize, length: usize| -> Vec<f64> {
@@ -187,17 +187,17 @@ mod tests {
         // 1e-14: a mean of 663 numbers that are 1 up to rounding.
         assert!((result.ssim - 1.0).abs() < 1e-14, "ssim {}", result.ssim);
         assert!(result.total.abs() < 1e-14);
-        // SSIM is at its maximum, so the gradient vanishes: the numbers it is a difference of are near 10.
+        // SSIM is at its maximum, so the gradient vanishes. It is a difference of numbers near 10.
         assert!(result.v_rgb.iter().flatten().all(|v| v.abs() < 1e-14));
     }
 
     #[test]
-    fn a_flat_image_has_the_ssim_of_its_two_levels_away_from_the_border() {
+    fn inside_the_border_flat_images_have_the_ssim_of_their_levels() {
         let (x, y): (f64, f64) = (0.25, 0.75);
         let map = ssim_map(&[x; 21 * 21], &[y; 21 * 21], 21, 21);
         let expected = (2.0 * x * y + C1) / (x * x + y * y + C1);
         assert!((map[10 * 21 + 10] - expected).abs() < 1e-12);
-        // At the corner the window sees zeros outside, so there is contrast.
+        // At the corner, the window includes zeros outside the picture, so there is contrast.
         assert!((map[0] - expected).abs() > 1e-3);
     }
 
@@ -224,10 +224,10 @@ mod tests {
     }
 
     #[test]
-    fn the_gradient_is_the_central_difference_with_and_without_a_mask() {
+    fn masked_or_not_the_gradient_is_the_central_difference() {
         let (width, height) = (13_u32, 11_u32);
         let (render, mut truth) = (noise(2, width * height), noise(3, width * height));
-        // |difference| has a kink at 0, and a central difference across it means nothing.
+        // |difference| has a kink at 0, where a central difference is meaningless.
         for (x, y) in render.iter().flatten().zip(truth.iter_mut().flatten()) {
             *y += if *y > *x { 1e-3 } else { -1e-3 };
         }
@@ -253,7 +253,7 @@ mod tests {
     }
 
     #[test]
-    fn an_ignored_pixel_changes_nothing_whatever_is_in_it() {
+    fn the_value_of_an_ignored_pixel_changes_nothing() {
         let (width, height) = (12_u32, 12_u32);
         let (mut render, truth) = (noise(6, 144), noise(7, 144));
         let mask: Vec<bool> = (0..144).map(|i| i % 5 != 0).collect();

@@ -1,29 +1,30 @@
 //! Priors on what is under water: the physics-aware dark channel (SMP-UWGS eq. 12 and 13) and depth
 //! smoothness (eq. 14).
 //!
-//! Maps are `[H*W]` row-major. Both losses are means over all pixels of a picture, whatever is masked, as
-//! that of the picture is (`loss`). The weights w_c and those of edges are constants in the gradient.
+//! Maps are `[H*W]` row-major. Both losses are means over all pixels of a picture, masked or not, like the
+//! loss of the picture (`loss`). The weights w_c and the weights of edges are constants in the gradient.
 
 use super::Blended;
 use fathom_core::water::{LEAST_ALPHA, RangeModulation, Water};
 
 /// Keeps the weight of a channel without attenuation finite (SMP-UWGS's code).
 pub const LEAST_ATTENUATION: f64 = 1e-6;
-/// Where the negative part turns from a parabola into a line, linear light (SeaSplat, SMP-UWGS's code).
+/// Value at which the negative part changes from a parabola to a line, linear light (SeaSplat, SMP-UWGS's
+/// code).
 const BEND: f64 = 0.2;
 
-/// A picture that has priors.
+/// The inputs of the priors for one picture.
 #[derive(Clone, Copy, Debug)]
 pub struct PriorView<'a> {
     /// Width and height, pixels.
     pub size: [usize; 2],
-    /// What was blended.
+    /// Blended pixels.
     pub blended: &'a [Blended],
     /// Whether a pixel counts.
     pub mask: &'a [bool],
-    /// Usual viewing distance, scene units.
+    /// The scene scale, scene units.
     pub unit: f64,
-    /// How the coefficients follow from range, where they do (eq. 9).
+    /// How the coefficients depend on range, with DBDR (eq. 9).
     pub refinement: Option<&'a RangeModulation>,
 }
 
@@ -48,29 +49,29 @@ pub struct DarkChannel {
 /// A prior's value and gradients.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct PriorLoss {
-    /// With its weight.
+    /// The loss, times its weight.
     pub total: f64,
-    /// By the light of which the dark channel is, `[H*W]`; empty for depth smoothness.
+    /// Gradient with respect to the light of the dark channel, `[H*W]`; empty for depth smoothness.
     pub v_light: Vec<[f64; 3]>,
-    /// By alpha, past the light.
+    /// Direct gradient with respect to alpha, without the part through the light.
     pub v_alpha: Vec<f64>,
-    /// By the blended range, past the light.
+    /// The same for the blended range.
     pub v_range: Vec<f64>,
-    /// By the nine numbers, past the light.
+    /// The same for the water parameters.
     pub v_water: [f64; 9],
-    /// By the four of eq. 9 in the order of [`RangeModulation::to_array`], past the light.
+    /// The same for the four parameters of eq. 9, in the order of [`RangeModulation::to_array`].
     pub v_refinement: [f64; 4],
 }
 
-/// w_c of eq. 12: 1 / `beta_d`, the largest as 1 (SMP-UWGS's code).
+/// w_c of eq. 12: 1 / `beta_d`, scaled so that the largest is 1 (SMP-UWGS's code).
 pub fn channel_weights(water: &Water, unit: f64) -> [f64; 3] {
     let raw = water.beta_d.map(|beta| 1.0 / (beta * unit + LEAST_ATTENUATION));
     let largest = raw.iter().copied().fold(0.0, f64::max);
     raw.map(|w| w / largest)
 }
 
-/// Smallest of w_c (I^c - B^c) and its channel, the first of equal ones; 0 in open water, `None` where it
-/// does not count.
+/// Smallest w_c (I^c - B^c) and its channel, the first of equal ones; 0 in open water. `None` where the pixel
+/// does not count or the value is not finite.
 fn signal(
     weights: [f64; 3],
     water: &Water,
@@ -95,8 +96,8 @@ fn signal(
     (counts && least.0.is_finite()).then_some(least)
 }
 
-/// Index of the smallest value in the patch around each pixel, the first in reading order of equal ones;
-/// `None` without any.
+/// Index of the smallest value in the patch around each pixel, the first in reading order of equal ones.
+/// `None` where the patch has no value.
 pub fn patch_minima(values: &[Option<f64>], size: [usize; 2], radius: usize) -> Vec<Option<usize>> {
     let [width, height] = size;
     let around = |at: usize, end: usize| at.saturating_sub(radius)..(at + radius + 1).min(end);
@@ -129,8 +130,8 @@ fn penalty(d: f64, negative: f64) -> (f64, f64) {
     }
 }
 
-/// The dark channel's loss. `light` is what it is of, linear: the picture under water, or the photograph; its
-/// gradient is beside those past it.
+/// Loss of the dark channel of `light`: the picture under water or the photograph, in linear light. Its
+/// gradient with respect to `light` is separate from the direct gradients.
 pub fn dark_channel(
     water: &Water,
     view: &PriorView<'_>,
@@ -186,7 +187,7 @@ pub fn dark_channel(
     loss
 }
 
-/// Depth smoothness with this weight; `photograph` in sRGB decides where edges are.
+/// Depth smoothness with this weight; the edges come from `photograph`, in sRGB.
 pub fn depth_smoothness(view: &PriorView<'_>, photograph: &[[f64; 3]], weight: f64) -> PriorLoss {
     let [width, height] = view.size;
     let pixels = width * height;
@@ -237,7 +238,7 @@ mod tests {
     }
 
     impl Maps {
-        /// Some pixels open water, some masked, direct signals on both sides of 0.
+        /// Some pixels are open water, some masked; direct signals have both signs.
         fn new(masked: f64) -> Self {
             let pixels = SIZE[0] * SIZE[1];
             let alpha = |i: usize| if i.is_multiple_of(6) { 0.0 } else { 0.05 + 0.95 * number(i, 0) };
@@ -258,7 +259,7 @@ mod tests {
     const CONFIG: DarkChannel = DarkChannel { weight: 0.7, negative: 30.0, radius: 2 };
 
     #[test]
-    fn gradients_of_the_dark_channel_are_central_differences_and_its_weights_are_constants() {
+    fn dark_channel_gradients_hold_its_weights_constant() {
         for masked in [0.0, 0.3] {
             for radius in [0, 1, 2, 20] {
                 let config = DarkChannel { radius, ..CONFIG };
@@ -278,7 +279,7 @@ mod tests {
                         let numeric = along(&|maps, h| maps.light[i][c] += h);
                         assert_close(&format!("{what}, light {c}"), loss.v_light[i][c], numeric, 1e-3);
                     }
-                    // Where alpha is 0 a step would make something of open water.
+                    // At alpha 0, a step would turn open water into a surface.
                     if maps.blended[i].alpha > 0.0 {
                         let by_alpha = along(&|maps, h| maps.blended[i].alpha += h);
                         assert_close(&format!("{what}, alpha"), loss.v_alpha[i], by_alpha, 1e-3);
@@ -294,7 +295,7 @@ mod tests {
                         dark_channel(&water, &maps.view(), &maps.light, &config).total
                     });
                     if k < 3 {
-                        assert_eq!(loss.v_water[k], 0.0, "the weights are constants");
+                        assert_eq!(loss.v_water[k], 0.0, "the weights must be constants");
                     } else {
                         assert_close(&format!("radius {radius}: water {k}"), loss.v_water[k], numeric, 1e-3);
                     }
@@ -304,7 +305,7 @@ mod tests {
     }
 
     #[test]
-    fn gradients_of_the_dark_channel_of_a_water_that_follows_from_range_are_central_differences() {
+    fn dark_channel_gradients_with_dbdr_are_central_differences() {
         let refinement = RangeModulation::identity(2.0, UNIT).with_array([0.3, -0.2, -0.7, 0.4]);
         let maps = Maps::new(0.1);
         let of = |maps: &Maps, refinement: &RangeModulation, water: &Water| {
@@ -332,7 +333,7 @@ mod tests {
                 values[k] += h;
                 of(&maps, &refinement.with_array(values), &WATER).total
             });
-            assert_close(&format!("number {k} of eq. 9"), loss.v_refinement[k], numeric, 1e-3);
+            assert_close(&format!("parameter {k} of eq. 9"), loss.v_refinement[k], numeric, 1e-3);
         }
         for k in 3..9 {
             let numeric = derivative(|h| {
@@ -368,7 +369,7 @@ mod tests {
     }
 
     #[test]
-    fn an_edge_of_either_sign_smooths_less_and_none_more_than_a_flat_photograph() {
+    fn an_edge_of_either_sign_smooths_less_than_a_flat_photograph() {
         let view = |photograph: [[f64; 3]; 2]| {
             let blended = [1.0, 2.0].map(|range| Blended { rgb: [0.0; 3], alpha: 1.0, range });
             let view =
@@ -382,7 +383,7 @@ mod tests {
     }
 
     #[test]
-    fn channels_that_the_water_takes_most_of_weigh_least_and_clear_water_weighs_all_alike() {
+    fn the_most_attenuated_channels_weigh_least() {
         let weights = channel_weights(&WATER, UNIT);
         assert!(weights[0] < weights[1] && weights[1] < weights[2]);
         assert_eq!(weights[2], 1.0);
@@ -395,7 +396,7 @@ mod tests {
         let size = [5, 4];
         let values = [Some(1.0); 20];
         let minima = patch_minima(&values, size, 1);
-        // The upper left corner of the patch, as far as it lies inside.
+        // The upper left corner of the patch, clipped to the picture.
         for (i, at) in minima.iter().enumerate() {
             let (x, y) = ((i % 5).saturating_sub(1), (i / 5).saturating_sub(1));
             assert_eq!(*at, Some(5 * y + x), "{i}");
@@ -407,7 +408,7 @@ mod tests {
     }
 
     #[test]
-    fn open_water_and_masked_pictures_have_no_dark_channel_and_no_gradient() {
+    fn open_water_and_masked_pictures_have_no_dark_channel() {
         let maps = Maps::new(0.0);
         let nothing = vec![Blended { rgb: [0.0; 3], alpha: 0.0, range: 0.0 }; maps.light.len()];
         let open = PriorView { blended: &nothing, ..maps.view() };

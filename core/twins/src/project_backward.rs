@@ -1,7 +1,7 @@
-//! Backward of `project_forward`: from the gradient of splats to the gradient of Gaussians.
+//! Backward pass of `project_forward`: from the gradient of splats to the gradient of Gaussians.
 //!
-//! `extent`, `half_size` and `depth` only choose and order, so they have no gradient. Where x/z or y/z
-//! was clamped inside J, that ratio is a constant there; the centre's own projection is never clamped.
+//! `extent`, `half_size` and `depth` only select and order splats, so they have no gradient. A ratio x/z or
+//! y/z that was clamped in J is a constant there. The projection of the centre is never clamped.
 
 use glam::{DMat3, DVec3};
 
@@ -54,15 +54,15 @@ fn backward_of_one(
     let geometry = Geometry::new(model, index, camera, pose, m);
     let (fx, fy) = (camera.fx, camera.fy);
 
-    // conic = cov2d^-1, so v_cov2d = -conic G conic with G the symmetric matrix of v_conic; `b` stands for
-    // two entries of the matrix, each of which carries half of its gradient.
+    // conic = cov2d^-1, so v_cov2d = -conic G conic, where G is the symmetric matrix of v_conic. `b` stands
+    // for two entries of the matrix; each has half of its gradient.
     let [a, b, c] = splat.conic;
     let [ga, gb, gc] = [v.conic[0], 0.5 * v.conic[1], v.conic[2]];
     let mut p = -(a * (ga * a + gb * b) + b * (gb * a + gc * b));
     let mut q = -(a * (ga * b + gb * c) + b * (gb * b + gc * c));
     let mut r = -(b * (ga * b + gb * c) + c * (gb * b + gc * c));
 
-    // opacity = sigmoid * c with c = |n| / sqrt(det cov2d), n = A_0 x A_1 and A the rows of T R S.
+    // opacity = sigmoid * c, where c = |n| / sqrt(det cov2d), n = A_0 x A_1, and A_k are the rows of T R S.
     let sigmoid = sigmoid(model.opacity_logits[index]);
     let (mut factor, mut v_axes) = (1.0, [DVec3::ZERO; 2]);
     if rules.mip_filter {
@@ -102,7 +102,7 @@ fn backward_of_one(
         fy * inv_z * v.mean2d[1],
         -(fx * m.x * v.mean2d[0] + fy * m.y * v.mean2d[1]) * inv_z * inv_z,
     );
-    // J = ((fx/z, 0, -fx u/z), (0, fy/z, -fy w/z)); u = x/z and w = y/z unless they are clamped.
+    // J = ((fx/z, 0, -fx u/z), (0, fy/z, -fy w/z)), where u = x/z and w = y/z unless they are clamped.
     let (u, w) = (geometry.ratio.x, geometry.ratio.y);
     v_m.z += (-fx * v_j0.x - fy * v_j1.y + fx * u * v_j0.z + fy * w * v_j1.z) * inv_z * inv_z;
     let (v_u, v_w) = (-fx * inv_z * v_j0.z, -fy * inv_z * v_j1.z);
@@ -131,12 +131,12 @@ fn backward_of_one(
     v_model.opacity_logits[index] = v.opacity * factor * sigmoid * (1.0 - sigmoid);
 }
 
-/// column a times row b.
+/// Column a times row b.
 fn outer(a: DVec3, b: DVec3) -> DMat3 {
     DMat3::from_cols(a * b.x, a * b.y, a * b.z)
 }
 
-/// Through R(q / |q|); `v_rotation` holds the derivative by each entry of R.
+/// Gradient of q through R(q / |q|); `v_rotation` is the derivative with respect to each entry of R.
 fn quat_backward(quat: [f64; 4], v_rotation: DMat3) -> [f64; 4] {
     let length = norm(quat);
     let unit = quat.map(|v| v / length);
@@ -164,7 +164,7 @@ mod tests {
     use crate::{NEAR, RasterRules};
     use fathom_core::rng::{Stream, uniform_at};
 
-    /// One weight for each number of a splat, so that the weighted sum is a loss.
+    /// One weight for each number of a splat; the weighted sum is the loss.
     fn weights(id: usize) -> SplatGradient {
         let u = |j| 2.0 * f64::from(uniform_at(21, Stream::Test, id as u32, j)) - 1.0;
         SplatGradient {
@@ -187,11 +187,11 @@ mod tests {
     }
 
     #[test]
-    fn the_gradient_is_the_central_difference_at_every_degree_and_shape() {
+    fn gradients_are_central_differences_at_every_degree_and_shape() {
         let (camera, pose) = off_centre_view(75, 53, 3.0);
         for (sh_degree, mip_filter) in [(0, false), (1, false), (2, false), (3, false), (1, true), (3, true)]
         {
-            // With the filter needles are too faint to be seen: no edge there.
+            // With the filter, needles are too faint to be visible, so edges are switched off.
             let edges = if mip_filter { RasterRules::SMOOTH } else { RasterRules::HARD };
             let rules = RasterRules { mip_filter, ..edges };
             for (name, model) in all(22 + u32::from(sh_degree), 12, 3) {
@@ -242,7 +242,7 @@ mod tests {
                 m.z > NEAR && Geometry::new(&model, id, &camera, &pose, m).inside != [true; 2]
             })
             .count();
-        // The central differences above pass over such Gaussians; this says that there are some.
+        // The central differences above include such Gaussians; this checks that some exist.
         assert!(clamped > 20, "{clamped}");
     }
 

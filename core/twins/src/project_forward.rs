@@ -1,9 +1,8 @@
 //! From a Gaussian to a splat in one camera (3DGS; EWA splatting, Zwicker et al. 2002).
 //!
-//! This stage is the only gate of visibility: whatever passes it is finite, in front of the camera and
-//! has a positive definite conic, so that no later stage has to look again. The guards are phrased
-//! positively (`depth > NEAR`), so that NaN fails them. Whether a splat reaches the image is decided
-//! by `intersect`.
+//! This stage alone decides visibility. Every splat that passes is finite, in front of the camera and has a
+//! positive definite conic, so no later stage checks again. The guards are phrased positively (`depth >
+//! NEAR`), so that NaN fails them. `intersect` decides whether a splat reaches the image.
 
 use glam::{DMat3, DVec2, DVec3};
 
@@ -19,7 +18,7 @@ pub struct Splat {
     pub conic: [f64; 3],
     /// Colour in the direction of the camera.
     pub rgb: [f64; 3],
-    /// Sigmoid of the logit, times the compensation of the low-pass where the rules have it.
+    /// Sigmoid of the logit, times the compensation of the low-pass with `mip_filter`.
     pub opacity: f64,
     /// Distance of the centre from the camera, scene units.
     pub range: f64,
@@ -31,9 +30,9 @@ pub struct Splat {
     pub half_size: [f64; 2],
 }
 
-/// Projects every Gaussian; `None` is culled.
+/// Projects every Gaussian; `None` where it is culled.
 ///
-/// `sh_degree` is that of the schedule; a lower one than the model's leaves the higher bands out.
+/// `sh_degree` is that of the schedule; if it is lower than the model's, the higher bands are left out.
 pub fn project_forward(
     model: &Gaussians64,
     camera: &PinholeCamera,
@@ -100,26 +99,26 @@ fn project(
     })
 }
 
-/// What forward and backward share: the frames and the linearised camera at one Gaussian.
+/// The frames and the linearised camera at one Gaussian, used by forward and backward.
 pub(super) struct Geometry {
     /// World to camera.
     pub world_to_camera: DMat3,
-    /// Axes of the Gaussian in the world, columns; orthonormal.
+    /// Axes of the Gaussian in the world, as orthonormal columns.
     pub rotation: DMat3,
     /// Standard deviations along them.
     pub scales: DVec3,
     /// Covariance in the world.
     pub sigma: DMat3,
-    /// Rows of J W, the derivative of the pixel by the world position.
+    /// Rows of J W, the derivative of the pixel position with respect to the world position.
     pub rows: [DVec3; 2],
-    /// x/z and y/z as J takes them, inside the bounds of [`ratio_bounds`].
+    /// x/z and y/z as used in J, clamped to [`ratio_bounds`].
     pub ratio: DVec2,
-    /// Whether x/z and y/z are inside the bounds by themselves.
+    /// Whether x/z and y/z are inside the bounds before clamping.
     pub inside: [bool; 2],
 }
 
 impl Geometry {
-    /// At Gaussian `index`, whose centre in the camera's frame is `m`.
+    /// The geometry at Gaussian `index`, whose centre in the camera's frame is `m`.
     pub fn new(model: &Gaussians64, index: usize, camera: &PinholeCamera, pose: &Pose, m: DVec3) -> Self {
         let world_to_camera = DMat3::from_quat(pose.rotation);
         let rotation = rotation_matrix(model.quats[index]);
@@ -157,7 +156,7 @@ impl Geometry {
     }
 }
 
-/// Coefficients of Gaussian `index` up to `sh_degree`, or up to what the model has.
+/// Coefficients of Gaussian `index` up to `sh_degree` or the degree of the model.
 pub(super) fn active_coeffs(model: &Gaussians64, index: usize, sh_degree: u8) -> &[[f64; 3]] {
     let stored = model.coeffs();
     let active = (usize::from(sh_degree) + 1).pow(2).min(stored);
@@ -172,8 +171,8 @@ pub(super) fn norm(quat: [f64; 4]) -> f64 {
     quat.iter().map(|v| v * v).sum::<f64>().sqrt()
 }
 
-/// Bounds of x/z and y/z in J: the image and 15 % of its size on each side (gsplat). Far outside the
-/// linearisation of the camera is meaningless and its covariance explodes.
+/// Bounds of x/z and y/z in J: the image and 15 % of its size on each side (gsplat). Far outside the image,
+/// the linearisation of the camera is meaningless and its covariance explodes.
 fn ratio_bounds(camera: &PinholeCamera) -> (DVec2, DVec2) {
     let size = DVec2::new(f64::from(camera.width), f64::from(camera.height));
     let focal = DVec2::new(camera.fx, camera.fy);
@@ -198,12 +197,12 @@ mod tests {
     use crate::samples::off_centre_view;
 
     #[test]
-    fn with_the_filter_the_low_pass_spreads_a_splat_and_adds_nothing_to_it() {
+    fn under_the_mip_filter_the_low_pass_keeps_a_splats_integral() {
         let (camera, pose) = off_centre_view(75, 53, 3.0);
         let mut model = Gaussians64::zeros(1, 0);
         model.quats[0] = [0.9, 0.1, -0.3, 0.2];
         let rules = RasterRules { mip_filter: true, ..RasterRules::SMOOTH };
-        // Far below a pixel to far above it; flat and round.
+        // From far below a pixel to far above it; flat and round.
         for log_scales in [[-7.0, -6.0, -6.5], [-4.0, -9.0, -3.0], [-1.0, -0.5, -2.0]] {
             model.log_scales[0] = log_scales;
             let m = pose.transform(model.means[0].into());

@@ -1,10 +1,15 @@
-//! Backward of `rasterize_forward`, per pixel front to back a second time.
+//! Backward pass of `rasterize_forward`, per pixel, front to back a second time.
 //!
-//! With q_i = rgb_i . v_rgb + range_i v_range, the gradient of a pixel by one of its alphas is
-//!     v_alpha_i = T_i q_i - (S_i + T_end (background . v_rgb - v_alpha)) / (1 - alpha_i)
-//! where T_i is what is left in front of splat i, S_i = sum over j behind i of alpha_j T_j q_j, and T_end
-//! what is left at the end. S_i is the pixel's whole sum less what has gone by, so one pass in the order of
-//! the forward suffices.
+//! With q_i = rgb_i . v_rgb + range_i v_range, the gradient of a pixel with respect to one of its
+//! alphas is
+//!
+//! ```text
+//! v_alpha_i = T_i q_i - (S_i + T_end (background . v_rgb - v_alpha)) / (1 - alpha_i)
+//! ```
+//!
+//! where T_i is the transmittance in front of splat i, S_i = sum over j behind i of alpha_j T_j q_j, and
+//! T_end is the transmittance at the end. S_i is the whole sum of the pixel minus the part up to i, so one
+//! pass in forward order suffices.
 
 use super::rasterize_forward::contribution;
 use super::{Raster, RasterRules, Splat, TILE, TileLists};
@@ -12,39 +17,39 @@ use super::{Raster, RasterRules, Splat, TILE, TileLists};
 /// Gradient of the loss with respect to the outputs of `rasterize_forward`.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct RasterGradients {
-    /// By colour, `[H*W]`.
+    /// With respect to colour, `[H*W]`.
     pub rgb: Vec<[f64; 3]>,
-    /// By alpha, `[H*W]`.
+    /// With respect to alpha, `[H*W]`.
     pub alpha: Vec<f64>,
-    /// By range, `[H*W]`.
+    /// With respect to range, `[H*W]`.
     pub range: Vec<f64>,
 }
 
 impl RasterGradients {
-    /// Gradient by colour only.
+    /// Gradient with respect to colour only.
     pub fn of_colour(rgb: Vec<[f64; 3]>) -> Self {
         let pixels = rgb.len();
         Self { rgb, alpha: vec![0.0; pixels], range: vec![0.0; pixels] }
     }
 }
 
-/// Gradient of the loss with respect to one [`Splat`], and what density control wants to know of it.
+/// Gradient of the loss with respect to one [`Splat`], and its statistics for density control.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct SplatGradient {
-    /// By the centre, per pixel.
+    /// With respect to the centre, per pixel.
     pub mean2d: [f64; 2],
-    /// By (a, b, c); `b` counted once.
+    /// With respect to (a, b, c); `b` counted once.
     pub conic: [f64; 3],
-    /// By the colour.
+    /// With respect to the colour.
     pub rgb: [f64; 3],
-    /// By the opacity (after the sigmoid).
+    /// With respect to the opacity (after the sigmoid).
     pub opacity: f64,
-    /// By the range.
+    /// With respect to the range.
     pub range: f64,
-    /// Sum over pixels of |v_mean2d.x| + |v_mean2d.y| of that pixel: does not cancel where a splat is pulled
-    /// to two sides (AbsGS). Not a gradient.
+    /// Sum over pixels of |v_mean2d.x| + |v_mean2d.y|. It does not cancel when pixels pull a splat in
+    /// opposite directions (AbsGS). Not a gradient.
     pub abs: f64,
-    /// Sum over pixels of alpha T: how much of the image it is. Not a gradient.
+    /// Sum over pixels of alpha T: its share of the image. Not a gradient.
     pub contribution: f64,
 }
 
@@ -166,13 +171,14 @@ mod tests {
         }
     }
 
-    /// `step` shrinks the step of the central difference; what is rounding grows with it.
+    /// `step` shrinks the step of the central difference; the tolerance for rounding grows accordingly.
     fn check(rules: &RasterRules, seed: u32, step: f64) {
         let (camera, pose) = off_centre_view(WIDTH, HEIGHT, 3.0);
         let v = weights();
         for (name, model) in all(seed, 16, 0) {
             let splats = project_forward(&model, &camera, &pose, 0, rules);
-            // The lists stay as they are while numbers move: a splat enters a tile at alpha = min_alpha only.
+            // The lists stay fixed while numbers change, because a splat enters a tile at alpha = min_alpha
+            // only.
             let lists = intersect(&splats, WIDTH, HEIGHT);
             let forward = |splats: &[Option<Splat>]| {
                 rasterize_forward(splats, &lists, WIDTH, HEIGHT, BACKGROUND, rules)
@@ -181,7 +187,7 @@ mod tests {
             let analytic = rasterize_backward(&splats, &lists, &raster, BACKGROUND, rules, &v);
             for id in (0..splats.len()).filter(|&id| splats[id].is_some()) {
                 for i in 0..10 {
-                    // A conic is some 0.01 / px^2, so its step is shorter.
+                    // A conic is about 0.01 / px^2, so its step is smaller.
                     let step = if (2..5).contains(&i) { 1e-2 * step } else { step };
                     let numeric = derivative(|h| {
                         let mut moved = splats.clone();
@@ -198,7 +204,7 @@ mod tests {
     }
 
     #[test]
-    fn the_gradient_is_the_central_difference_where_blending_has_no_edges() {
+    fn without_edges_the_gradient_is_the_central_difference() {
         check(&RasterRules::SMOOTH, 32, 1.0);
     }
 
@@ -229,14 +235,14 @@ mod tests {
     }
 
     #[test]
-    fn with_all_edges_the_gradient_is_the_central_difference_between_them() {
-        // Where alpha crosses min_alpha within a step the image jumps, and the difference is of the order of
-        // 1/255 / H. So the step is a hundredth, and these seeds have no crossing in it.
+    fn between_edges_the_gradient_is_the_central_difference() {
+        // If alpha crosses min_alpha within a step, the image jumps and the difference is of order 1/255 / H.
+        // So the step is a hundredth of H, and these seeds have no crossing in it.
         check(&RasterRules::HARD, 33, 1e-2);
     }
 
     #[test]
-    fn contribution_is_the_share_of_the_image_and_abs_bounds_the_gradient() {
+    fn contribution_sums_to_alpha_and_abs_bounds_the_gradient() {
         let (camera, pose) = off_centre_view(WIDTH, HEIGHT, 3.0);
         let v = weights();
         for rules in [RasterRules::HARD, RasterRules::SMOOTH] {
@@ -245,7 +251,7 @@ mod tests {
                 let lists = intersect(&splats, WIDTH, HEIGHT);
                 let raster = rasterize_forward(&splats, &lists, WIDTH, HEIGHT, BACKGROUND, &rules);
                 let v_splats = rasterize_backward(&splats, &lists, &raster, BACKGROUND, &rules, &v);
-                // Sum of alpha T over splats telescopes to 1 - T at each pixel.
+                // The sum of alpha T over splats telescopes to 1 - T at each pixel.
                 let shares: f64 = v_splats.iter().map(|s| s.contribution).sum();
                 let alphas: f64 = raster.alpha.iter().sum();
                 assert!((shares - alphas).abs() < 1e-10 * alphas, "{name}: {shares} and {alphas}");

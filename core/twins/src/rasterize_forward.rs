@@ -1,10 +1,14 @@
-//! Blending, front to back (3DGS eq. 3), one tile after the other and one pixel after the other.
+//! Blending, front to back (3DGS eq. 3), tile by tile and pixel by pixel.
 //!
 //! Per pixel, over the splats of its tile by depth:
-//!     sigma = 0.5 (a dx^2 + c dy^2) + b dx dy,   d = mean2d - pixel centre
-//!     alpha = min(max_alpha, opacity exp(-sigma))
-//!     C += alpha T c,   R += alpha T range,   T <- T (1 - alpha)
-//! A splat with alpha < min_alpha is skipped; the pixel stops before the one that would leave less than
+//!
+//! ```text
+//! sigma = 0.5 (a dx^2 + c dy^2) + b dx dy,   d = mean2d - pixel centre
+//! alpha = min(max_alpha, opacity exp(-sigma))
+//! C += alpha T c,   R += alpha T range,   T <- T (1 - alpha)
+//! ```
+//!
+//! A splat with alpha < min_alpha is skipped. The pixel stops before a splat that would leave less than
 //! `min_transmittance`. Outputs: rgb = C + T background, alpha = 1 - T, range = R.
 
 use super::{RasterRules, Splat, TILE, TileLists};
@@ -24,8 +28,8 @@ pub struct Raster {
     pub range: Vec<f64>,
     /// T behind the last splat.
     pub transmittance: Vec<f64>,
-    /// How many entries of the tile's list were looked at when the pixel's last splat was blended: the
-    /// entries from here on gave nothing. 0 where nothing was blended.
+    /// One past the entry of the tile's list that the pixel blended last; later entries add nothing. 0 where
+    /// nothing was blended.
     pub last: Vec<u32>,
 }
 
@@ -90,7 +94,7 @@ pub fn rasterize_forward(
     raster
 }
 
-/// What `splat` gives to pixel (x, y), or `None` where it is skipped.
+/// Contribution of `splat` to pixel (x, y), or `None` where it is skipped.
 pub(super) fn contribution(splat: &Splat, x: u32, y: u32, rules: &RasterRules) -> Option<Contribution> {
     let [a, b, c] = splat.conic;
     let delta = [splat.mean2d[0] - (f64::from(x) + 0.5), splat.mean2d[1] - (f64::from(y) + 0.5)];

@@ -1,6 +1,6 @@
-//! Seeded scenes that are hard on a renderer: for the tests of the twins and of the kernels.
+//! Seeded scenes that are hard for a renderer, for the tests of the twins and the kernels.
 //!
-//! Every number is made in f32, so that a kernel and its twin start from the same bits.
+//! Every number is computed in f32, so that a kernel and its twin start from the same bits.
 
 use glam::DVec3;
 
@@ -10,8 +10,8 @@ use fathom_core::rng::{Stream, uniform_at};
 use fathom_core::scene::{PinholeCamera, Pose};
 use fathom_core::views::{InMemory, TrainView};
 
-/// A view whose size is no multiple of a tile, whose principal point is off the centre and whose
-/// pixels are not square. It looks along z from about `eye_distance` in front of the origin, a little turned.
+/// A view with an off-centre principal point and pixels that are not square. It looks along z from about
+/// `eye_distance` in front of the origin, slightly turned.
 pub fn off_centre_view(width: u32, height: u32, eye_distance: f64) -> (PinholeCamera, Pose) {
     let (w, h) = (f64::from(width), f64::from(height));
     let camera = PinholeCamera { width, height, fx: 0.9 * w, fy: 1.05 * w, cx: 0.41 * w, cy: 0.57 * h };
@@ -19,12 +19,12 @@ pub fn off_centre_view(width: u32, height: u32, eye_distance: f64) -> (PinholeCa
     (camera, Pose::looking_at(eye, DVec3::new(0.05, 0.1, 0.0), DVec3::new(0.1, 1.0, 0.05)))
 }
 
-/// Grey photographs, for runs of which only the work matters.
+/// Grey photographs, for runs that only need work to do.
 pub fn grey(views: Vec<TrainView>) -> InMemory {
     InMemory::plain(views, 0xff80_8080)
 }
 
-/// `count` Gaussians in a box of side 2 around the origin, of all sizes, turns, opacities and colours.
+/// `count` Gaussians in a box of side 2 around the origin, with all sizes, rotations, opacities and colours.
 pub fn random(seed: u32, count: usize, sh_degree: u8) -> Gaussians {
     let mut model = Gaussians::empty(sh_degree);
     for i in 0..count as u32 {
@@ -42,7 +42,7 @@ pub fn random(seed: u32, count: usize, sh_degree: u8) -> Gaussians {
     model
 }
 
-/// The same, each a needle: one axis a thousand times as long as the other two.
+/// The same as needles: one axis is a thousand times as long as the other two.
 pub fn needles(seed: u32, count: usize, sh_degree: u8) -> Gaussians {
     let mut model = random(seed, count, sh_degree);
     for scales in &mut model.log_scales {
@@ -63,8 +63,8 @@ pub fn huge(seed: u32, count: usize, sh_degree: u8) -> Gaussians {
     model
 }
 
-/// The same, larger and spread over three times the width, so that most centres are outside the image of
-/// [`off_centre_view`] and many beyond the bounds of the linearisation.
+/// The same, larger and spread over three times the width. Most centres are outside the image of
+/// [`off_centre_view`], and many are beyond the bounds of the linearisation.
 pub fn beyond_the_border(seed: u32, count: usize, sh_degree: u8) -> Gaussians {
     let mut model = random(seed, count, sh_degree);
     for (mean, scales) in model.means.iter_mut().zip(&mut model.log_scales) {
@@ -74,7 +74,7 @@ pub fn beyond_the_border(seed: u32, count: usize, sh_degree: u8) -> Gaussians {
     model
 }
 
-/// Gaussians that must not be drawn from [`off_centre_view`], each with its fault.
+/// Gaussians that must not be drawn from [`off_centre_view`], each with the name of its fault.
 pub fn degenerate(sh_degree: u8) -> (Gaussians, Vec<&'static str>) {
     type Fault = (&'static str, fn(&mut Gaussians));
     let faults: [Fault; 13] = [
@@ -86,7 +86,7 @@ pub fn degenerate(sh_degree: u8) -> (Gaussians, Vec<&'static str>) {
         ("quaternion of length 0", |g| g.quats[0] = [0.0; 4]),
         ("NaN in the scale", |g| g.log_scales[0][0] = f32::NAN),
         ("scale of minus infinity", |g| g.log_scales[0][1] = f32::NEG_INFINITY),
-        ("scale beyond all numbers", |g| g.log_scales[0] = [1000.0; 3]),
+        ("scale that overflows", |g| g.log_scales[0] = [1000.0; 3]),
         ("NaN in the opacity", |g| g.opacity_logits[0] = f32::NAN),
         ("opacity 0", |g| g.opacity_logits[0] = f32::NEG_INFINITY),
         ("opacity under 1/255", |g| g.opacity_logits[0] = -6.0),
@@ -101,7 +101,7 @@ pub fn degenerate(sh_degree: u8) -> (Gaussians, Vec<&'static str>) {
     (model, faults.iter().map(|(name, _)| *name).collect())
 }
 
-/// All scenes by name, in f64: what every backward is checked on.
+/// All scenes by name, in f64, for the checks of every backward pass.
 pub fn all(seed: u32, count: usize, sh_degree: u8) -> Vec<(&'static str, Gaussians64)> {
     [
         ("random", random(seed, count, sh_degree)),

@@ -8,8 +8,8 @@ use glam::DVec3;
 use fathom_core::gaussians::MAX_SH_COEFFS;
 use fathom_core::harmonics::{C1, C2, C3, sh_basis};
 
-/// Derivatives of the polynomials of [`sh_basis`] by x, y and z, taken as independent; the caller
-/// projects onto the sphere.
+/// Derivatives of the polynomials of [`sh_basis`] with respect to independent x, y and z; the caller projects
+/// onto the sphere.
 pub fn sh_basis_gradient(direction: DVec3) -> [DVec3; MAX_SH_COEFFS] {
     let DVec3 { x, y, z } = direction;
     let (xx, yy, zz) = (x * x, y * y, z * z);
@@ -35,15 +35,16 @@ pub fn sh_basis_gradient(direction: DVec3) -> [DVec3; MAX_SH_COEFFS] {
 
 /// RGB of one Gaussian seen along `direction` (unit, from the camera to the Gaussian).
 ///
-/// `coeffs` are the K coefficients in use: (degree of the schedule + 1)^2 of those that are stored. NaN
-/// stays NaN (`max` would make it black), so that the gate of `project_forward` sees it.
+/// `coeffs` are the K coefficients in use: the first (degree of the schedule + 1)^2 stored ones. NaN stays
+/// NaN (`max` would make it black), so that the gate of `project_forward` detects it.
 pub fn sh_colour(direction: DVec3, coeffs: &[[f64; 3]]) -> [f64; 3] {
     unclamped_colour(direction, coeffs).map(|c| if c < 0.0 { 0.0 } else { c })
 }
 
-/// Backward of [`sh_colour`]: adds to `v_coeffs` and returns the gradient of `direction` as a free vector.
+/// Backward pass of [`sh_colour`]: adds to `v_coeffs` and returns the gradient of `direction` as a free
+/// vector.
 ///
-/// A channel that was clamped to 0 gives no gradient.
+/// A channel that was clamped to 0 has no gradient.
 pub fn sh_colour_backward(
     direction: DVec3,
     coeffs: &[[f64; 3]],
@@ -109,7 +110,7 @@ mod tests {
     }
 
     #[test]
-    fn the_basis_is_the_real_spherical_harmonics_with_the_condon_shortley_phase() {
+    fn the_basis_is_real_harmonics_with_the_condon_shortley_phase() {
         for i in 0..50 {
             let d = direction(i);
             let (basis, phi) = (sh_basis(d), d.y.atan2(d.x));
@@ -126,7 +127,7 @@ mod tests {
                     };
                     let expected = phase * norm * angle * legendre(l, a, d.z);
                     let k = (l * l + l + m) as usize;
-                    // 1e-13: some tens of roundings of numbers near 1.
+                    // 1e-13: some tens of rounding errors of numbers near 1.
                     assert!((basis[k] - expected).abs() < 1e-13, "Y_{l}^{m}: {} != {expected}", basis[k]);
                 }
             }
@@ -134,7 +135,7 @@ mod tests {
     }
 
     #[test]
-    fn the_mean_square_over_a_band_is_the_same_in_every_band_and_direction() {
+    fn the_mean_square_of_a_band_is_the_same_in_all_directions() {
         for i in 0..50 {
             let basis = sh_basis(direction(i));
             for l in 0..=3_usize {
@@ -157,8 +158,8 @@ mod tests {
                         moved[axis] += h;
                         sh_basis(moved)[k]
                     });
-                    // Polynomials of degree 3: the extrapolated difference is exact up to rounding, 1e-16 /
-                    // 1e-4.
+                    // For polynomials of degree 3, the extrapolated difference is exact up to rounding, 1e-16
+                    // / 1e-4.
                     assert!((gradient[k][axis] - numeric).abs() < 1e-10, "Y_{k} by axis {axis}");
                 }
             }

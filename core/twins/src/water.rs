@@ -1,8 +1,9 @@
-//! Water between Gaussians and camera (SMP-UWGS eq. 7), its backward, and Adam on its nine numbers (eq. 8).
+//! Water between Gaussians and camera (SMP-UWGS eq. 7), its backward pass, and Adam on the water parameters
+//! (eq. 8).
 //!
-//! Colours of Gaussians are J in sRGB; they are decoded, put under water by their own range (or not, where
-//! the water acts on pixels), and blended in linear light or, encoded again, in sRGB. The curve goes on above
-//! 1 and, straight, below 0.
+//! Colours of Gaussians are J in sRGB. They are blended in sRGB or, decoded, in linear light. Water on
+//! Gaussians acts on the decoded colour at the Gaussian's own range, before blending. Water on pixels acts
+//! after blending. The sRGB curve continues above 1, and as a straight line below 0.
 
 use super::{SplatGradient, adam_update_with};
 use fathom_core::config::{Blend, Medium};
@@ -11,7 +12,7 @@ use fathom_core::water::{LEAST_ALPHA, Water};
 /// Largest factor on the rate of a colour under water.
 pub const MAX_COLOUR_LR_SCALE: f64 = 8.0;
 
-/// Linear light of an sRGB value not below 0 (IEC 61966-2-1), and its derivative.
+/// Linear light of an sRGB value, clamped to at least 0 (IEC 61966-2-1), and its derivative.
 pub fn decode(s: f64) -> (f64, f64) {
     let s = s.max(0.0);
     if s <= 0.040_45 {
@@ -31,8 +32,8 @@ pub fn encode(l: f64) -> (f64, f64) {
     }
 }
 
-/// Linear light of a Gaussian of colour `rgb` (sRGB, not below 0) at `range`: blended where the water acts on
-/// Gaussians, as it is or, with [`Blend::Srgb`], encoded.
+/// Linear light of a Gaussian of colour `rgb` (sRGB, not below 0) seen at `range`. Where the water acts on
+/// Gaussians, this light is blended: as it is or, with [`Blend::Srgb`], encoded.
 pub fn in_water(water: &Water, rgb: [f64; 3], range: f64) -> [f64; 3] {
     std::array::from_fn(|c| {
         decode(rgb[c]).0 * (-water.beta_d[c] * range).exp()
@@ -40,9 +41,9 @@ pub fn in_water(water: &Water, rgb: [f64; 3], range: f64) -> [f64; 3] {
     })
 }
 
-/// What the rate of channel `c` of the constant colour is multiplied by under water: 1 over the slope of what
-/// is seen, in sRGB too, between 1 and [`MAX_COLOUR_LR_SCALE`]. Higher bands keep their rate
-/// (bench/history.jsonl).
+/// Factors on the learning rates of the constant colour under water, per channel. Each is the inverse slope
+/// of the visible sRGB value with respect to the colour, between 1 and [`MAX_COLOUR_LR_SCALE`]. Higher bands
+/// keep their rate (bench/history.jsonl).
 pub fn lr_scale_under_water(water: &Water, rgb: [f64; 3], range: f64) -> [f64; 3] {
     let seen = in_water(water, rgb, range);
     std::array::from_fn(|c| {
@@ -51,8 +52,9 @@ pub fn lr_scale_under_water(water: &Water, rgb: [f64; 3], range: f64) -> [f64; 3
     })
 }
 
-/// Backward of [`in_water`]: replaces the gradient by what is blended with that by the colour, adds that by
-/// the range to the splat's, and what goes to the nine numbers to `v_water`.
+/// Backward pass of [`in_water`]. Replaces the gradient with respect to the blended light by that with
+/// respect to the colour. Adds to the gradient of the splat's range, and adds the gradient of the water
+/// parameters to `v_water`.
 pub fn in_water_backward(
     water: &Water,
     blend: Blend,
@@ -81,7 +83,7 @@ pub fn in_water_backward(
 /// A pixel after `rasterize_forward`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Blended {
-    /// What was blended over black.
+    /// Colour blended over black.
     pub rgb: [f64; 3],
     /// 1 - transmittance.
     pub alpha: f64,
@@ -89,8 +91,8 @@ pub struct Blended {
     pub range: f64,
 }
 
-/// J of a pixel times its alpha in linear light where the water acts on pixels, from what was blended of a
-/// channel; its derivatives by that and by alpha.
+/// For water on pixels: J of a pixel times its alpha, in linear light, from the blended value of a channel.
+/// Also its derivatives with respect to the blended value and to alpha.
 fn own_light(blend: Blend, blended: f64, alpha: f64) -> (f64, f64, f64) {
     match blend {
         Blend::Linear => (blended, 1.0, 0.0),
@@ -106,14 +108,13 @@ fn own_light(blend: Blend, blended: f64, alpha: f64) -> (f64, f64, f64) {
     }
 }
 
-/// How much of a pixel of this alpha has the water behind it that ends no ray, its own alpha included, and
-/// the derivative.
+/// Share of a pixel that contains water, and its derivative with respect to alpha. Over black, only the part
+/// that alpha covers; else the whole pixel.
 fn watery_share(blend: Blend, alpha: f64) -> (f64, f64) {
     if blend == Blend::OverBlack { (alpha, 1.0) } else { (1.0, 0.0) }
 }
 
-/// A pixel under water: in the light that was blended where the water acts on Gaussians, else in linear
-/// light.
+/// A pixel under water. With water on Gaussians, it is in the light of the blending, else in linear light.
 pub fn form(water: &Water, medium: Medium, blend: Blend, pixel: &Blended) -> [f64; 3] {
     let Blended { rgb, alpha, range } = *pixel;
     std::array::from_fn(|c| match medium {
@@ -128,7 +129,7 @@ pub fn form(water: &Water, medium: Medium, blend: Blend, pixel: &Blended) -> [f6
     })
 }
 
-/// Channel `c` of open water in the light that is blended, and its derivative by `b_inf`.
+/// Channel `c` of open water in the light of the blending, and its derivative with respect to `b_inf`.
 fn open(water: &Water, blend: Blend, c: usize) -> (f64, f64) {
     match blend {
         Blend::Srgb | Blend::OverBlack => encode(water.b_inf[c]),
@@ -136,7 +137,8 @@ fn open(water: &Water, blend: Blend, c: usize) -> (f64, f64) {
     }
 }
 
-/// Backward of [`form`]: gradient by the pixel, given that by what is formed; adds to `v_water`.
+/// Backward pass of [`form`]: returns the gradient with respect to the pixel, from the gradient `v` with
+/// respect to the formed colour; adds to `v_water`.
 pub fn form_backward(
     water: &Water,
     medium: Medium,
@@ -177,10 +179,10 @@ pub fn form_backward(
     by
 }
 
-/// The nine unconstrained numbers with Adam's state.
+/// The unconstrained water parameters with Adam's state.
 #[derive(Clone, Debug, PartialEq)]
 pub struct WaterState {
-    /// Unconstrained numbers of eq. 8.
+    /// Unconstrained parameters of eq. 8.
     pub raw: [f64; 9],
     first: [f64; 9],
     second: [f64; 9],
@@ -188,13 +190,13 @@ pub struct WaterState {
 }
 
 impl WaterState {
-    /// At `water`, whose coefficients are counted in 1 / `unit`.
+    /// Starts at `water`. `unit` is the scene scale: coefficients are multiplied by it.
     pub fn new(water: &Water, unit: f64) -> Self {
         Self { raw: water.to_raw(unit), first: [0.0; 9], second: [0.0; 9], steps: 0 }
     }
 
-    /// One step of Adam (memories 0.9 and 0.999) on the gradient by the nine numbers; `decay` weighs their
-    /// squares (eq. 16), coefficients counted in 1 / `unit`.
+    /// Takes one step of Adam (decay 0.9 and 0.999) with the gradient of the water parameters. `decay` is the
+    /// weight of their squares (eq. 16), with coefficients multiplied by `unit`.
     pub fn step(&mut self, v_water: &[f64; 9], unit: f64, rate: f64, decay: f64) {
         self.steps += 1;
         let v_raw = self.v_raw(v_water, unit, decay);
@@ -204,7 +206,8 @@ impl WaterState {
         }
     }
 
-    /// Gradient by the nine unconstrained numbers, from that by the nine; as [`WaterState::step`].
+    /// Gradient of the unconstrained parameters from that of the water parameters; arguments as in
+    /// [`WaterState::step`].
     pub fn v_raw(&self, v_water: &[f64; 9], unit: f64, decay: f64) -> [f64; 9] {
         std::array::from_fn(|i| {
             let sigmoid = 1.0 / (1.0 + (-self.raw[i]).exp());
@@ -217,7 +220,7 @@ impl WaterState {
         })
     }
 
-    /// The nine numbers.
+    /// The water parameters.
     pub fn water(&self, unit: f64) -> Water {
         Water::from_raw(self.raw, unit)
     }
@@ -233,7 +236,7 @@ mod tests {
     const WATER: Water =
         Water { beta_d: [0.32, 0.11, 0.08], beta_b: [0.26, 0.14, 0.11], b_inf: [0.025, 0.11, 0.19] };
 
-    const WAYS: [(Medium, Blend); 5] = [
+    const COMPOSITIONS: [(Medium, Blend); 5] = [
         (Medium::PerGaussian, Blend::Srgb),
         (Medium::PerGaussian, Blend::Linear),
         (Medium::PerPixel, Blend::Linear),
@@ -252,21 +255,21 @@ mod tests {
     }
 
     #[test]
-    fn the_curve_and_its_slope_are_those_of_srgb() {
+    fn the_curve_and_its_slope_match_srgb() {
         for i in 1..200 {
             let x = f64::from(i) / 100.0;
             assert!((decode(x).0 - srgb_to_linear(x)).abs() < 1e-15);
             assert!((encode(x).0 - linear_to_srgb(x)).abs() < 1e-15);
-            // Both curves have a bend; 0.03 and 0.04 on either side of one.
+            // Both curves have a bend; 0.03 and 0.04 are on either side of one.
             assert_close(&format!("decode at {x}"), decode(x).1, derivative(|h| decode(x + h).0), 1e-6);
             assert_close(&format!("encode at {x}"), encode(x).1, derivative(|h| encode(x + h).0), 1e-6);
         }
-        assert_eq!(encode(-0.01), (-0.01 * 12.92, 12.92), "noise below 0 keeps a gradient");
+        assert_eq!(encode(-0.01), (-0.01 * 12.92, 12.92), "values below 0 must keep a gradient");
         assert_eq!(decode(-0.5), decode(0.0));
     }
 
     #[test]
-    fn gradients_through_the_water_of_a_gaussian_are_central_differences() {
+    fn gradients_through_water_on_gaussians_are_central_differences() {
         for i in 0..20 {
             let blend = [Blend::Srgb, Blend::Linear][(i % 2) as usize];
             let rgb = [number(i, 0), number(i, 1), 1.3 * number(i, 2)];
@@ -298,8 +301,8 @@ mod tests {
     }
 
     #[test]
-    fn gradients_through_the_water_of_a_pixel_are_central_differences() {
-        for (medium, blend) in WAYS {
+    fn gradients_through_water_on_pixels_are_central_differences() {
+        for (medium, blend) in COMPOSITIONS {
             for i in 0..20 {
                 let alpha = 0.05 + 0.95 * number(i, 3);
                 let rgb = [alpha * number(i, 0), alpha * number(i, 1), alpha * number(i, 2)];
@@ -331,7 +334,7 @@ mod tests {
     }
 
     #[test]
-    fn one_opaque_layer_is_the_same_either_way_and_nothing_is_open_water_or_black() {
+    fn an_opaque_layer_looks_the_same_under_every_composition() {
         let (rgb, range) = ([0.6, 0.4, 0.3], 5.0);
         let layer = |colour| Blended { rgb: colour, alpha: 1.0, range };
         let light = in_water(&WATER, rgb, range);
@@ -347,7 +350,7 @@ mod tests {
             }
         }
         let nothing = Blended { rgb: [0.0; 3], alpha: 0.0, range: 0.0 };
-        for (medium, blend) in WAYS {
+        for (medium, blend) in COMPOSITIONS {
             let is_encoded = (medium, blend) == (Medium::PerGaussian, Blend::Srgb);
             let open = WATER.b_inf.map(|l| if is_encoded { encode(l).0 } else { l });
             let open = if blend == Blend::OverBlack { [0.0; 3] } else { open };
@@ -356,7 +359,7 @@ mod tests {
     }
 
     #[test]
-    fn adam_finds_a_water_from_the_gradients_of_a_sum_of_squares_whatever_the_unit() {
+    fn adam_finds_the_water_at_any_scene_scale() {
         for unit in [0.01, 1.0, 300.0] {
             let scaled = |water: &Water| {
                 let [d, b] = [water.beta_d, water.beta_b].map(|beta| beta.map(|value| value * 7.0 / unit));
@@ -373,13 +376,13 @@ mod tests {
                 state.step(&v, unit, 0.02 * 0.998_f64.powi(k), 0.0);
             }
             for (found, goal) in state.water(unit).to_array().iter().zip(goal.to_array()) {
-                assert!((found / goal - 1.0).abs() < 1e-3, "{found} {goal} in units of {unit}");
+                assert!((found / goal - 1.0).abs() < 1e-3, "{found} and {goal} at scene scale {unit}");
             }
         }
     }
 
     #[test]
-    fn the_weight_on_the_squares_makes_the_nine_smaller() {
+    fn the_l2_weight_shrinks_the_water_parameters() {
         let mut state = WaterState::new(&WATER, 7.0);
         (0..50).for_each(|_| state.step(&[0.0; 9], 7.0, 0.01, 1e-4));
         let pairs = state.water(7.0).to_array().into_iter().zip(WATER.to_array());
