@@ -2,13 +2,14 @@
 
 use std::time::Duration;
 
-use crate::support::{FakeTrainer, TestCluster, reason_of};
+use crate::callers::{is, said};
+use crate::support::{FakeTrainer, TestCluster};
 use bytes::Bytes;
 use fathom_coordinator::retention::Policy;
 use fathom_core::scene::{BlobRef, Manifest};
 use fathom_proto::v1;
 use fathom_worker::blobs::{BlobSource, to_proto};
-use tonic::{Code, Status};
+use tonic::Code;
 use tonic_types::StatusExt;
 
 fn file(path: &str, blob: &BlobRef) -> v1::DatasetFile {
@@ -21,15 +22,6 @@ fn begin(id: &str, files: Vec<v1::DatasetFile>) -> v1::BeginUploadRequest {
 
 fn commit(id: &str) -> v1::CommitDatasetRequest {
     v1::CommitDatasetRequest { dataset_id: id.into() }
-}
-
-fn refusal<T: std::fmt::Debug>(answer: Result<T, Status>) -> (Code, String) {
-    let status = answer.unwrap_err();
-    (status.code(), reason_of(&status))
-}
-
-fn is(code: Code, reason: &str) -> (Code, String) {
-    (code, reason.to_owned())
 }
 
 /// The files of the cluster's scene, and its manifest beside them.
@@ -51,7 +43,7 @@ async fn a_complete_dataset_is_committed_and_serves_many_jobs() {
     // The photographs exist already; only the manifest is missing.
     assert_eq!((begun.missing_count, begun.missing), (1, vec![to_proto(&BlobRef::of(&json))]));
     let early = cluster.uploads().commit_dataset(commit("wreck")).await;
-    assert_eq!(refusal(early), is(Code::FailedPrecondition, "BLOB_NOT_FOUND"));
+    assert_eq!(said(early), is(Code::FailedPrecondition, "BLOB_NOT_FOUND"));
     let create = |request: &str, dataset: &str, manifest| v1::CreateJobRequest {
         request_id: request.into(),
         name: request.into(),
@@ -61,7 +53,7 @@ async fn a_complete_dataset_is_committed_and_serves_many_jobs() {
         ..Default::default()
     };
     let early = cluster.jobs().create_job(create("early", "wreck", None)).await;
-    assert_eq!(refusal(early), is(Code::FailedPrecondition, "DATASET_NOT_COMMITTED"));
+    assert_eq!(said(early), is(Code::FailedPrecondition, "DATASET_NOT_COMMITTED"));
 
     cluster.blobs().upload(&BlobSource::Bytes(json.clone())).await.unwrap();
     let frozen = cluster.uploads().commit_dataset(commit("wreck")).await.unwrap().into_inner();
@@ -85,13 +77,10 @@ async fn a_complete_dataset_is_committed_and_serves_many_jobs() {
     assert_eq!(std::fs::read_to_string(&list).unwrap(), sorted.iter().map(line).collect::<String>());
 
     let other = cluster.uploads().begin_upload(begin("wreck", files[..3].to_vec())).await;
-    assert_eq!(refusal(other), is(Code::AlreadyExists, "REQUEST_ID_REUSED"));
+    assert_eq!(said(other), is(Code::AlreadyExists, "REQUEST_ID_REUSED"));
     let other =
         v1::BeginUploadRequest { request_id: "another".into(), ..begin("wreck", files[..3].to_vec()) };
-    assert_eq!(
-        refusal(cluster.uploads().begin_upload(other).await),
-        is(Code::AlreadyExists, "DATASET_EXISTS")
-    );
+    assert_eq!(said(cluster.uploads().begin_upload(other).await), is(Code::AlreadyExists, "DATASET_EXISTS"));
 
     let _worker = cluster.worker(FakeTrainer::quick());
     for request in ["one", "two"] {
@@ -110,10 +99,10 @@ async fn a_complete_dataset_is_committed_and_serves_many_jobs() {
     assert_eq!(status.code(), Code::InvalidArgument);
     assert!(status.message().contains("view_00.png, which is not among"), "{status}");
     let nowhere = cluster.jobs().create_job(create("nowhere", "reef", None)).await;
-    assert_eq!(refusal(nowhere), is(Code::NotFound, "DATASET_NOT_FOUND"));
+    assert_eq!(said(nowhere), is(Code::NotFound, "DATASET_NOT_FOUND"));
     let delete = v1::DeleteDatasetRequest { dataset_id: "wreck".into() };
     assert_eq!(
-        refusal(cluster.uploads().delete_dataset(delete).await),
+        said(cluster.uploads().delete_dataset(delete).await),
         is(Code::FailedPrecondition, "DATASET_IN_USE")
     );
 }
@@ -141,7 +130,7 @@ async fn datasets_are_never_collected_and_abandoned_uploads_expire() {
     round(Duration::ZERO).await;
     assert!(is_there(&kept).await && !is_there(&given_up).await);
     let gone = v1::GetDatasetRequest { dataset_id: "given-up".into() };
-    assert_eq!(refusal(cluster.uploads().get_dataset(gone).await), is(Code::NotFound, "DATASET_NOT_FOUND"));
+    assert_eq!(said(cluster.uploads().get_dataset(gone).await), is(Code::NotFound, "DATASET_NOT_FOUND"));
     let delete = v1::DeleteDatasetRequest { dataset_id: "kept".into() };
     cluster.uploads().delete_dataset(delete).await.unwrap();
     round(Duration::ZERO).await;
@@ -163,7 +152,7 @@ async fn many_files_are_named_by_a_list_and_listed_by_page() {
     let list = BlobRef::of(text.as_bytes());
     let request = || v1::BeginUploadRequest { list: Some(to_proto(&list)), ..begin("", Vec::new()) };
     let early = cluster.uploads().begin_upload(request()).await;
-    assert_eq!(refusal(early), is(Code::FailedPrecondition, "BLOB_NOT_FOUND"));
+    assert_eq!(said(early), is(Code::FailedPrecondition, "BLOB_NOT_FOUND"));
     cluster.blobs().upload(&BlobSource::Bytes(text.into())).await.unwrap();
     let many = cluster.uploads().begin_upload(request()).await.unwrap().into_inner().dataset.unwrap();
     assert_eq!((many.files, many.size_bytes, many.root), (10_001, 110_011, Some(to_proto(&list))));
@@ -186,11 +175,7 @@ async fn many_files_are_named_by_a_list_and_listed_by_page() {
     let rest = page(first.next_page_token.clone()).await.unwrap();
     assert_eq!((rest.datasets.len(), rest.next_page_token.as_str()), (1, ""));
     for wrong in ["c", "c/00000000", &first.next_page_token.replace('c', "b"), "/", "../x"] {
-        assert_eq!(
-            refusal(page(wrong.to_owned()).await),
-            is(Code::InvalidArgument, "BAD_ARGUMENT"),
-            "{wrong}"
-        );
+        assert_eq!(said(page(wrong.to_owned()).await), is(Code::InvalidArgument, "BAD_ARGUMENT"), "{wrong}");
     }
 }
 

@@ -5,11 +5,10 @@
 mod support;
 
 use std::collections::{BTreeMap, HashSet};
-use std::net::SocketAddr;
 use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 
-use crate::support::{FakeTrainer, TestCluster, incarnation_of, page, reason_of, registration};
+use crate::support::{FakeTrainer, TestCluster, free_address, incarnation_of, page, reason_of, registration};
 use fathom_observe::{Guard, LogFormat, Logging};
 use fathom_proto::dial::{Connection, Dial};
 use fathom_proto::v1;
@@ -66,10 +65,6 @@ fn sum(series: &BTreeMap<String, f64>, family: &str, labels: &[&str]) -> f64 {
     let found =
         series.iter().filter(|(name, _)| of_family(name) && labels.iter().all(|label| name.contains(label)));
     found.map(|(_, value)| value).sum()
-}
-
-fn free_address() -> SocketAddr {
-    std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap()
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

@@ -1,18 +1,13 @@
 //! One worker process with several GPUs; the coordinator sees one worker per GPU.
 
 use std::collections::BTreeSet;
-use std::net::SocketAddr;
 use std::sync::Arc;
 
-use crate::support::{FakeTrainer, TestCluster, page};
+use crate::support::{FakeTrainer, TestCluster, free_address, page};
 use fathom_proto::v1;
 use fathom_proto::worker::v1::Capabilities;
 use fathom_worker::OnGpu;
 use fathom_worker::execute::{Control, Executor, TaskError, TaskInput, TaskOutput};
-
-fn free_address() -> SocketAddr {
-    std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap()
-}
 
 /// The value of one series.
 fn value(page: &str, series: &str) -> f64 {

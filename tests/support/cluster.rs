@@ -368,6 +368,11 @@ pub fn registration(name: &str) -> worker_v1::RegisterRequest {
     }
 }
 
+/// A loopback address that was free a moment ago.
+pub fn free_address() -> SocketAddr {
+    std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap()
+}
+
 pub fn reason_of(status: &tonic::Status) -> String {
     status.get_details_error_info().map(|info| info.reason).unwrap_or_default()
 }
