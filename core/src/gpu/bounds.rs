@@ -118,7 +118,7 @@ mod tests {
     }
 
     #[test]
-    fn spatial_order_is_a_permutation_that_keeps_neighbours_together() {
+    fn spatial_order_is_a_permutation_with_neighbours_together() {
         let mut model = random(7, 8 * CULL_CHUNK);
         model.log_scales[77] = [4.0; 3];
         model.means[99] = [f32::NAN; 3];

@@ -270,7 +270,7 @@ impl Gpu {
     /// A zeroed buffer that some kernels read as a uniform and others write.
     ///
     /// # Errors
-    /// [`CoreError::OutOfMemory`] where there is no room.
+    /// [`CoreError::OutOfMemory`] when memory runs out.
     pub fn parameters(&self, label: &'static str, bytes: u64) -> Result<wgpu::Buffer> {
         let buffer = self.allocate(&wgpu::BufferDescriptor {
             label: Some(label),
@@ -288,8 +288,8 @@ impl Gpu {
     /// A zeroed storage buffer.
     ///
     /// # Errors
-    /// [`CoreError::BufferTooLarge`] beyond the binding limit, [`CoreError::OutOfMemory`] where there is no
-    /// room.
+    /// [`CoreError::BufferTooLarge`] beyond the binding limit, [`CoreError::OutOfMemory`] when memory runs
+    /// out.
     pub fn buffer(&self, label: &'static str, bytes: u64) -> Result<wgpu::Buffer> {
         // Releases replaced buffers before the new one is allocated.
         self.kernels.forget_bind_groups();

@@ -11,10 +11,10 @@ use crate::{CoreError, Result};
 
 /// Faults that were reported and not yet checked.
 #[derive(Default)]
-pub(super) struct Faults(Mutex<Said>);
+pub(super) struct Faults(Mutex<Pending>);
 
 #[derive(Default)]
-struct Said {
+struct Pending {
     /// The first error since the last check; later errors are mostly consequences of it.
     first: Option<CoreError>,
     loss: Option<Loss>,
@@ -51,17 +51,17 @@ impl Faults {
         faults
     }
 
-    fn lock(&self) -> MutexGuard<'_, Said> {
+    fn lock(&self) -> MutexGuard<'_, Pending> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Keeps an error for the next check.
     pub(super) fn report(&self, error: CoreError) {
-        let mut said = self.lock();
-        if let (CoreError::OutOfMemory { .. }, Some(loss)) = (&error, &mut said.loss) {
+        let mut pending = self.lock();
+        if let (CoreError::OutOfMemory { .. }, Some(loss)) = (&error, &mut pending.loss) {
             loss.by_memory = true;
         }
-        said.first.get_or_insert(error);
+        pending.first.get_or_insert(error);
     }
 
     fn lose(&self, message: String) {
@@ -118,9 +118,9 @@ fn polled(faults: &Faults, poll: impl FnOnce() -> Result<wgpu::PollStatus, wgpu:
         Ok(Ok(_)) => Ok(()),
         Ok(Err(error)) => Err(CoreError::Gpu(format!("waiting for the device: {error}"))),
         Err(panic) => {
-            let said = panic.downcast_ref::<String>().map(String::as_str);
-            let said = said.or_else(|| panic.downcast_ref::<&str>().copied());
-            faults.lose(said.unwrap_or("wgpu panicked while it waited").to_owned());
+            let message = panic.downcast_ref::<String>().map(String::as_str);
+            let message = message.or_else(|| panic.downcast_ref::<&str>().copied());
+            faults.lose(message.unwrap_or("wgpu panicked while it waited").to_owned());
             Err(faults.loss().unwrap_or_else(|| CoreError::Gpu("waiting for the device".into())))
         }
     }

@@ -139,7 +139,8 @@ impl Trainer {
         }
     }
 
-    /// Records the stages between the blended image and its gradient: appearances, loss, appearances backward.
+    /// Records the stages between the blended image and its gradient: appearances, loss, appearances
+    /// backward.
     fn record_loss(&self, recorder: &mut Recorder<'_>, now: &Iteration<'_>) -> Result<()> {
         let pictures = self.appearances.record(recorder, now, &self.frame.targets()?.image)?;
         let weight = self.config.ssim_weight;

@@ -168,7 +168,8 @@ impl Trainer {
         let lists = lists(&gpu, &config, views.views(), &focus, &context, medium.as_ref());
         let mut frame = Frame::new(&gpu, gaussians, lists.visible, lists.intersections)?;
         let slot_gradients = slot_gradients(&gpu, &frame)?;
-        // Sized for the largest image, so that a run that cannot hold it fails here and not at full resolution.
+        // Sized for the largest image, so that a run that cannot hold it fails here and not at full
+        // resolution.
         let light = medium.as_ref().map_or(LossLight::Srgb, |medium| medium.config.loss_light);
         let mut loss = Loss::new(&gpu)?.in_light(light).times(config.loss_factor);
         let schedule = Schedule::new(&config, medium.as_ref());

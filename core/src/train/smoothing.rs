@@ -64,7 +64,8 @@ impl Trainer {
     }
 }
 
-/// The model with the 3D filter in its scales and opacities; `smoothing` `[N]`: standard deviations, scene units.
+/// The model with the 3D filter in its scales and opacities; `smoothing` `[N]`: standard deviations, scene
+/// units.
 pub fn smoothed(mut model: Gaussians, smoothing: &[f32]) -> Gaussians {
     for (index, &width) in smoothing.iter().enumerate().filter(|(_, width)| **width > 0.0) {
         let mut share = 1.0;

@@ -316,7 +316,7 @@ mod tests {
     }
 
     #[test]
-    fn photographs_are_read_once_and_errors_belong_to_their_photograph() {
+    fn photographs_are_read_once_and_errors_stay_with_theirs() {
         for threads in [1, 2, 5] {
             let numbers = Arc::new(Numbers::default());
             let views: Arc<dyn ViewSource> = Arc::clone(&numbers) as Arc<dyn ViewSource>;
@@ -383,18 +383,26 @@ mod tests {
             for (view, weight) in weights.iter().enumerate() {
                 let share = 7.0 * weight / sum;
                 let even = [share.floor() as u32, share.ceil() as u32];
-                assert!(even.contains(&now[view]), "view {view} appeared {} times in epoch {epoch}", now[view]);
+                assert!(
+                    even.contains(&now[view]),
+                    "view {view} appeared {} times in epoch {epoch}",
+                    now[view]
+                );
                 seen[view] += now[view];
             }
         }
         for (view, weight) in weights.iter().enumerate() {
-            // Each epoch rounds up with the right probability: five standard deviations of the mean of a coin.
+            // Each epoch rounds up with the right probability: five standard deviations of the mean of a
+            // coin.
             let (share, found) = (7.0 * weight / sum, seen[view] as f32 / epochs as f32);
             let tolerance = 5.0 * 0.5 / (epochs as f32).sqrt();
             assert!((found - share).abs() < tolerance, "view {view}: {found} per epoch, not {share}");
         }
         let [mut once, mut again] = [(); 2].map(|()| weighted(&weights));
-        assert!((0..70).all(|at| once.view_at(at) == again.view_at(at)), "the order differs between two runs");
+        assert!(
+            (0..70).all(|at| once.view_at(at) == again.view_at(at)),
+            "the order differs between two runs"
+        );
     }
 
     #[test]

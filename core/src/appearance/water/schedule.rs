@@ -48,8 +48,8 @@ impl WaterSchedule {
         Some((interpolate_log(water.lr, water.lr_end, share.clamp(0.0, 1.0)), iteration - first + 1))
     }
 
-    /// Whether colours have no higher bands at this share of the run (`water.sh0_while_free`).
-    pub fn has_plain_colours(&self, progress: f32) -> bool {
+    /// Whether colours are limited to SH degree 0 at this share of the run (`water.sh0_while_free`).
+    pub fn has_sh0_only(&self, progress: f32) -> bool {
         let decided = self.network_end as f32 / self.iterations as f32;
         let moves = |water: &WaterConfig| progress < if water.descends() { water.freeze_at } else { decided };
         self.free.as_ref().is_some_and(|water| water.sh0_while_free && moves(water))
