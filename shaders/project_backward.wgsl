@@ -11,11 +11,11 @@
 // one step of Adam (adam.wgsl, moments_*.wgsl) with the step count of this Gaussian. Gaussians without any
 // gradient in this view are not changed.
 //
-// Learning rates: 3DGS applies Adam to all Gaussians in every iteration. There, the second moment of a
-// Gaussian that a share p of the views sees also averages zeros, so its steps are 1 / sqrt(p) larger for each
-// view that sees it. `lr_scale` does the same here, with p the share of the trainable Gaussians that this
-// view sees. It does not apply to scales and the higher bands. Under water the constant colour has a factor
-// of its own (water.wgsl).
+// Learning rates: 3DGS applies Adam to all Gaussians in every iteration. If a share p of the views sees a
+// Gaussian, its second moment there also averages zeros. Its steps are then 1 / sqrt(p) larger for each view
+// that sees it. `lr_scale` does the same here, with p the share of the trainable Gaussians that this view
+// sees. It does not apply to scales and the higher bands. Under water the constant colour has a factor of its
+// own (water.wgsl).
 //
 // Regularisation, per visit: weights on opacity and scale and noise on the means. 3DGS-MCMC (Kheradmand et
 // al. 2024) applies them to every Gaussian in every iteration; here the weights are divided by the number of
@@ -311,9 +311,9 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     transforms[3u * i] = new0;
     transforms[3u * i + 1u] = new1;
     transforms[3u * i + 2u] = vec4<f32>(new2, bitcast<f32>(count));
-    // For density control: sum of the pixel gradient, visits, then the smoothing (smoothing.wgsl), then the
-    // sum of the gradient w.r.t. the centre in units of half an image, as in 3DGS, whose pixel coordinates
-    // run from -1 to 1.
+    // For density control: sum of the pixel gradient, visits, the smoothing (smoothing.wgsl), and the sum of
+    // the gradient w.r.t. the centre. The last is in units of half an image, as in 3DGS, whose pixel
+    // coordinates run from -1 to 1.
     let by_centre = length(0.5 * vec2<f32>(frame.size) * g0.xy);
     density_sums[i] = vec4<f32>(seen.x + g1.w, seen.y + 1.0, seen.z, seen.w + by_centre);
 }

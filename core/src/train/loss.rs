@@ -85,7 +85,7 @@ impl Loss {
     /// Buffers that must be written before they are read. Tests fill them with garbage first.
     ///
     /// # Errors
-    /// When no room was made.
+    /// When [`Loss::prepare`] was not called.
     pub fn scratch(&self) -> Result<[&wgpu::Buffer; 4]> {
         let sized = self.sized()?;
         Ok([&sized.moments, &sized.partials, &sized.smoothed, &sized.sums])
@@ -100,7 +100,7 @@ impl Loss {
     /// Gradient with respect to the image, `[H*W]` vec4; the alpha entry is 0.
     ///
     /// # Errors
-    /// When no room was made.
+    /// When [`Loss::prepare`] was not called.
     pub fn v_image(&self) -> Result<&wgpu::Buffer> {
         Ok(&self.sized()?.v_image)
     }
@@ -108,7 +108,7 @@ impl Loss {
     /// The photograph of the last comparison, `[H*W]` packed; one buffer for all views.
     ///
     /// # Errors
-    /// When no room was made.
+    /// When [`Loss::prepare`] was not called.
     pub fn truth(&self) -> Result<&wgpu::Buffer> {
         Ok(&self.sized()?.truth)
     }
@@ -116,7 +116,7 @@ impl Loss {
     /// Gradient with respect to the range image: 0, because no term of this loss depends on it.
     ///
     /// # Errors
-    /// When no room was made.
+    /// When [`Loss::prepare`] was not called.
     pub fn v_range(&self) -> Result<&wgpu::Buffer> {
         Ok(&self.sized()?.v_range)
     }
@@ -124,7 +124,7 @@ impl Loss {
     /// Records the loss between `image` (the render) and `truth`.
     ///
     /// # Errors
-    /// When a kernel does not compile or no room was made.
+    /// When a kernel does not compile or [`Loss::prepare`] was not called.
     pub fn record(
         &self,
         gpu: &Gpu,
