@@ -383,6 +383,7 @@ impl Blocks {
     /// The same Gaussians, sharing their transforms on the device, with coefficients of degree 0 of their
     /// own, all 0. For images of quantities other than the model's colours.
     ///
+    /// # Errors
     /// When the device cannot hold the coefficients: 48 bytes per Gaussian.
     pub fn sharing_transforms(&self, gpu: &Gpu) -> Result<Self> {
         let mut shared = Self::new(gpu, 0)?;

@@ -102,6 +102,7 @@ pub fn adapters() -> Vec<AdapterSummary> {
 /// The first device, including one on the CPU, for the test `what`. `None`, with a message on stderr, if
 /// there is none.
 ///
+/// # Panics
 /// When there is an adapter but it cannot be opened, or when `FATHOM_TEST_REQUIRE_GPU=1` and there is no
 /// adapter: a CI that has a driver must not pass without it.
 pub fn device_for_test(what: &str) -> Option<Arc<Gpu>> {
@@ -142,6 +143,7 @@ pub struct Gpu {
 impl Gpu {
     /// Opens a device.
     ///
+    /// # Errors
     /// [`CoreError::NoAdapter`] with the package to install, or the flag that allows the CPU;
     /// [`CoreError::Config`] for a memory limit that cannot be enforced.
     pub fn new(options: GpuOptions) -> Result<Arc<Self>> {
@@ -150,6 +152,7 @@ impl Gpu {
 
     /// Opens a device with a given tile layout, so that one machine can test the layouts of others.
     ///
+    /// # Errors
     /// As [`Gpu::new`]; also when the adapter lacks the subgroups that the layout needs.
     pub fn with_layout(options: GpuOptions, layout: TileLayout) -> Result<Arc<Self>> {
         Self::open(options, Some(layout))
@@ -349,6 +352,7 @@ impl Gpu {
 
     /// Reads `count` values from `offset` bytes on. Waits for all submitted work.
     ///
+    /// # Errors
     /// When the device failed before or during the copy, or memory ran out.
     pub fn read<T: bytemuck::Pod>(&self, buffer: &wgpu::Buffer, offset: u64, count: usize) -> Result<Vec<T>> {
         let bytes = (count * size_of::<T>()) as u64;

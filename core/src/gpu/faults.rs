@@ -88,6 +88,7 @@ impl Faults {
 impl Gpu {
     /// The error that the device reported outside any call since the last check, if any.
     ///
+    /// # Errors
     /// That error. A loss is [`CoreError::DeviceLost`], or [`CoreError::OutOfMemory`] if wgpu could not
     /// recover. After a loss every call fails with it, and a new device must be opened. After other errors
     /// the device remains usable.

@@ -43,6 +43,7 @@ impl ListLimits {
     /// Number of bands for a view that overflowed with `bands`: more by the ratio of needed to allowed
     /// length, plus a fifth.
     ///
+    /// # Errors
     /// [`CoreError::BufferTooLarge`] when every band is already a single tile.
     pub fn more_bands(&self, overflow: Overflow, bands: u32, tiles: u32) -> Result<u32> {
         if bands >= tiles {
@@ -514,6 +515,7 @@ impl Frame {
 
     /// Replaces the lists, keeping targets and limits, and clears the sticky bit.
     ///
+    /// # Errors
     /// When the device cannot hold them in addition to the old ones, which then stay.
     pub fn replace_lists(&mut self, gpu: &Gpu, visible: u32, intersections: u32) -> Result<()> {
         let new = Self::new(gpu, self.gaussian_capacity, visible, intersections)?.with_limits(self.limits);

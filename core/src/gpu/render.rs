@@ -173,8 +173,8 @@ impl Renderer {
         self
     }
 
-    /// Renders through this water, or the [`WaterView::output`] of it, for models whose colours are J. Images
-    /// remain in sRGB. Where the water is visible, open water replaces the background.
+    /// Renders through this water, for models whose colours are J; [`WaterView::output`] selects the image.
+    /// Images remain in sRGB. Where the water is visible, open water replaces the background.
     #[must_use]
     pub fn with_water(mut self, water: Option<WaterView>) -> Self {
         self.set_water(water);
@@ -205,6 +205,7 @@ impl Renderer {
 
     /// Renders over `background`.
     ///
+    /// # Errors
     /// When the device fails, or cannot bind the lists of a single tile.
     pub fn render(&mut self, camera: &PinholeCamera, pose: &Pose, background: [f32; 3]) -> Result<Rendered> {
         draw(&self.gpu, &mut self.frame, &self.blocks, &mut self.options, (camera, pose), background)
@@ -214,6 +215,7 @@ impl Renderer {
     /// blended [`Gaussians::normals_towards`] the camera, in camera axes (x right, y down, z forward). Zero
     /// where alpha is 0 or where normals cancel out.
     ///
+    /// # Errors
     /// As [`Renderer::render`]; also when `model` has a different number of Gaussians, or the device cannot
     /// hold 48 more bytes per Gaussian.
     pub fn normals(

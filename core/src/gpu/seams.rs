@@ -22,6 +22,7 @@ impl SeamRun {
     /// Uploads the surfaces of `model`: [`Gaussians::surfaces`] with `viewing_distance`, the scene scale of
     /// its plan, scene units.
     ///
+    /// # Errors
     /// When the device cannot hold them in addition to what it already holds.
     pub fn new(
         gpu: &Arc<Gpu>,
@@ -38,6 +39,7 @@ impl SeamRun {
     /// As [`SeamRun::new`], but returns `None` and logs a warning if the device has no room. A model that can
     /// be rendered is thus always evaluated, with or without its borders.
     ///
+    /// # Errors
     /// When the device fails for another reason.
     pub fn if_it_fits(
         gpu: &Arc<Gpu>,

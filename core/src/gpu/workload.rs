@@ -23,6 +23,7 @@ impl Frame {
     /// Counts the work of the forward pass of `view`, and waits for it. For a view in bands, counts the last
     /// band.
     ///
+    /// # Errors
     /// When targets are missing or the device fails.
     pub fn workload(&self, gpu: &Gpu, view: &FrameUniform) -> Result<Workload> {
         let counters: Vec<u32> = gpu.read(&self.counters, 0, counter::COUNT as usize)?;

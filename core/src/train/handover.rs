@@ -4,8 +4,8 @@
 //! (`partition.neighbours_from`), or both.
 //!
 //! The result is a run of its own. It is determined by the first run, the checkpoint and what it continues
-//! with, and the digest of its checkpoints covers all three. Everything else continues: the kept Gaussians,
-//! moments, the iteration and all schedules.
+//! with, and the digest of its checkpoints covers all of these. Everything else continues: the kept
+//! Gaussians, moments, the iteration and all schedules.
 
 use std::sync::Arc;
 
@@ -31,6 +31,7 @@ impl Trainer {
     /// If nothing changes, the bytes equal those of the uninterrupted `run`. Nothing changes if `medium` is
     /// the water that the run has by then, fixed in both, and the context is the same.
     ///
+    /// # Errors
     /// [`crate::CoreError::Checkpoint`] when `state` is torn or belongs to another run;
     /// [`crate::CoreError::Config`] when a `medium` is given but `run` has no water.
     pub fn hand_over(
@@ -136,6 +137,7 @@ impl Trainer {
 
     /// Moves the run to `checkpoint`, which must be one of the same run.
     ///
+    /// # Errors
     /// [`crate::CoreError::Checkpoint`] when it is torn or belongs to another run; the run then stays where
     /// it was.
     pub fn go_to(&mut self, checkpoint: &[u8]) -> Result<()> {

@@ -29,6 +29,7 @@ impl Trainer {
     /// Renders the current Gaussians in focus from the `held_out` views and compares. `None` if there are no
     /// views, or if `go_on`, which is called before each view, returns false.
     ///
+    /// # Errors
     /// When a photograph cannot be read, or the device cannot hold a second copy of the model.
     pub fn measure(
         &mut self,

@@ -185,6 +185,7 @@ impl Trainer {
     /// Work of the forward pass of the previous iteration; for a view in bands, of its last band. Waits for
     /// the device; for benchmarks.
     ///
+    /// # Errors
     /// When no iteration has run yet or the device fails.
     pub fn last_workload(&mut self) -> Result<Workload> {
         let key = self.view_of(self.iteration.saturating_sub(1));

@@ -220,6 +220,7 @@ impl Trainer {
     /// Resumes the same run from one of its checkpoints. The result has the same bytes as an uninterrupted
     /// run.
     ///
+    /// # Errors
     /// [`CoreError::Checkpoint`] when the bytes are torn or belong to another run; start a new run then.
     pub fn resume(gpu: Arc<Gpu>, run: TrainRun, checkpoint: &[u8]) -> Result<Self> {
         let mut trainer = Self::new(gpu, run)?;
