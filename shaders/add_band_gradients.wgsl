@@ -1,9 +1,9 @@
 //@ import frame, counters, gaussian, splat, gather_slots
-// Adds the gradients of the slots of one band of tiles to those of the bands before it.
+// Adds the slot gradients of one band of tiles to the sums of the bands before it.
 //
-//   band_gradients [N*3]  vec4, as in splat.wgsl: by Gaussian of the block
-// Tiles are emitted in reading order and bands are taken in it, so the sum is the one that a single band
-// gives, to the bit. One thread a Gaussian of the block that the band sees.
+//   band_gradients [N*3]  vec4, as in splat.wgsl: per Gaussian of the block
+// Tiles are emitted in reading order and bands follow it, so the sum equals that of a single band to the bit.
+// One thread per Gaussian of the block that the band sees.
 
 @group(0) @binding(0) var<uniform> frame: Frame;
 @group(0) @binding(1) var<uniform> block: Block;

@@ -1,6 +1,6 @@
 //@ import frame, counters, dispatch
-// After the scan of the counts: how many intersections there are, and the sizes of what follows. One thread.
-// See count_visible for the sticky overflow.
+// After the scan of the counts: the number of intersections, and the sizes of the dispatches that follow. One
+// thread. See count_visible for the sticky overflow bit.
 
 @group(0) @binding(0) var<uniform> frame: Frame;
 @group(0) @binding(1) var<storage, read> sums: array<u32>;
@@ -17,7 +17,7 @@ fn main() {
         counters[OVERFLOW] = 2u;
         counters[FAILED_AT] = frame.iteration;
         counters[NEEDED_INTERSECTIONS] = needed;
-        // Nothing that was started for this view may end in a step.
+        // No work already recorded for this view may end in a step.
         counters[VISIBLE] = 0u;
         put(ARGS_VISIBLE, 0u);
         for (var b = 0u; b < veiled(frame.blocks, arrayLength(&args)); b++) {

@@ -1,8 +1,8 @@
 //@ import frame, counters, dispatch
-// After the scan of the flags: how many Gaussians are visible, and the sizes of what follows.
+// After the scan of the flags: the number of visible Gaussians, and the sizes of the dispatches that follow.
 //
-// One thread. A list that would overflow sets the sticky bit and makes this and every later iteration do
-// nothing until the host has grown the list and cleared the bit; so the steps do not depend on capacities.
+// One thread. A list that would overflow sets the sticky bit. Then this and all later iterations do nothing
+// until the host has grown the list and cleared the bit. So the steps do not depend on capacities.
 
 @group(0) @binding(0) var<uniform> frame: Frame;
 @group(0) @binding(1) var<storage, read> sums: array<u32>;
@@ -27,8 +27,8 @@ fn main() {
     put(ARGS_VISIBLE_SCAN, groups_for(visible, SCAN_CHUNK));
     put(ARGS_DEPTH_SORT, chunks);
     put(ARGS_DEPTH_SCAN, groups_for(chunks * SORT_BINS, SCAN_CHUNK));
-    // Visible Gaussians are numbered block after block. Blocks at the end may be empty: there are no flags
-    // behind the last Gaussian.
+    // Visible Gaussians are numbered block by block. Blocks at the end may be empty: there are no flags after
+    // the last Gaussian.
     for (var b = 0u; b < veiled(frame.blocks, arrayLength(&args)); b++) {
         var start = visible;
         if block_bases[b] < frame.gaussians {

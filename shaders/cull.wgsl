@@ -1,12 +1,12 @@
 //@ import frame, gaussian, projection
 // Marks the Gaussians that a view may see.
 //
-// A bound on the projected box (no covariance needed): the standard deviation of a splat in pixels is at most
-// f/z * sqrt(1 + u^2 + v^2) * max scale plus that of the low-pass. Guards are phrased positively, so NaN
-// fails them. The 2D part of frame.mip_filter only makes splats fainter; the 3D part widens them here too.
-// Chunks that cull_chunks found out of sight are not looked at. One thread a Gaussian; flags [gaussians] are
-// 0 or 1 and are scanned next.
-// Twin: none of its own; the kernel test compares the frame's visible set with
+// The test bounds the projected box without a covariance. The standard deviation of a splat in pixels is at
+// most f/z * sqrt(1 + u^2 + v^2) * max scale, plus that of the low-pass. Guards are phrased positively, so
+// NaN fails them. The 2D part of frame.mip_filter only makes splats fainter; the 3D part also widens them
+// here. Chunks that cull_chunks rejected are skipped.
+// One thread per Gaussian; flags [gaussians] are 0 or 1 and are scanned next.
+// Twin: none of its own; the kernel test compares the visible set of the frame with
 // core/twins/src/project_forward.rs.
 
 @group(0) @binding(0) var<uniform> frame: Frame;
@@ -35,7 +35,7 @@ fn may_be_seen(i: u32) -> bool {
     }
     let ratio = clamp(m.xy / m.z, frame.ratio_min, frame.ratio_max);
     let deviations = sqrt(2.0 * max(log(255.0 * opacity), 0.0));
-    // 1 % and half a pixel of slack: this test may pass too many, never too few.
+    // Slack of 1 % and half a pixel: this test may pass too many Gaussians, never too few.
     let spread = 1.01 * sqrt(1.0 + dot(ratio, ratio)) * max_scale / m.z;
     let reach = deviations * (frame.focal * spread + vec2<f32>(sqrt(BLUR))) + vec2<f32>(0.5);
     let mean2d = frame.focal * m.xy / m.z + frame.principal;
@@ -47,7 +47,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         @builtin(local_invocation_index) lane: u32) {
     let i = folded(group, groups) * 64u + lane;
     if i < block.count {
-        // The Gaussians of a workgroup are of one chunk.
+        // All Gaussians of a workgroup belong to one chunk.
         if chunk_seen[i / CHUNK] == 0u {
             flags[block.base + i] = 0u;
         } else {

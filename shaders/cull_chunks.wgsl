@@ -1,21 +1,22 @@
 //@ import frame, gaussian
-// Which chunks of a block that does not change may be seen, by the box around each (core/src/gpu/bounds.rs).
+// Which chunks of a frozen block may be visible, from the bounding box of each (core/src/gpu/bounds.rs).
 //
-// A Gaussian at camera position m, of reach R, passes the test of `cull` at an edge of the picture only if
+// A Gaussian at camera position m with reach R passes the test of `cull` at an edge of the image only if
 //     f m.x + (p - edge + s) m.z + f k R > 0,   s = 3.33 sqrt(blur) + 0.5,   k = 1.01 sqrt(1 + most ratio^2)
-// and the like for the others: linear in m, so the box is out if its most favourable corner fails. One per
-// cent and a little more of slack, since this test may pass too many, never too few.
+// and similarly for the other edges. This is linear in m, so the box is outside if its most favourable corner
+// fails. The slack is slightly larger than in `cull`, because this test may pass too many chunks, never too
+// few.
 //
-//   bounds      [chunks*2] vec4: (centre, greatest reach; below 0 for none), (half sides, 0)
+//   bounds      [chunks*2] vec4: (centre, largest reach; below 0 if there is none), (half sides, 0)
 //   chunk_seen  [chunks]   0 or 1
-// One thread a chunk.
+// One thread per chunk.
 
 @group(0) @binding(0) var<uniform> frame: Frame;
 @group(0) @binding(1) var<uniform> block: Block;
 @group(0) @binding(2) var<storage, read> bounds: array<vec4<f32>>;
 @group(0) @binding(3) var<storage, read_write> chunk_seen: array<u32>;
 
-// The greatest of a . m + c over the box, with slack for rounding.
+// The maximum of a . m + c over the box, with slack for rounding.
 fn greatest(a: vec3<f32>, c: f32, centre: vec3<f32>, half_sides: vec3<f32>) -> f32 {
     let size = dot(abs(a), abs(centre) + half_sides) + abs(c);
     return dot(a, centre) + c + dot(abs(a), half_sides) + 1e-5 * size;
@@ -33,7 +34,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let half_sides = bounds[2u * chunk + 1u].xyz;
     let most = max(abs(frame.ratio_min), abs(frame.ratio_max));
     let spread = 1.02 * sqrt(1.0 + dot(most, most)) * reach;
-    // sqrt(2 ln 255) deviations of the low-pass.
+    // sqrt(2 ln 255) standard deviations of the low-pass.
     let pad = 3.4 * sqrt(BLUR) + 0.6;
     let x = frame.view_x;
     let y = frame.view_y;

@@ -1,16 +1,17 @@
 //@ import frame, water, medium, priors
-// Physics-aware dark channel, step 6 of 6: what of the gradient goes through the backscatter B of the signal.
+// Physics-aware dark channel, step 6 of 6: the part of the gradient that flows through the backscatter B of
+// the signal.
 //
-//     v_B^c = -w_c v_m for the channel c that m is;  B = b_inf (1 - a e),  e = exp(-beta_b r),  r = R/a
-//     by R: b_inf beta_b e,  by a: -b_inf e (1 + beta_b r),  by beta_b: b_inf a r e,  by b_inf: 1 - a e
-//   image         [H*W] vec4: what was blended, and alpha
+//     v_B^c = -w_c v_m for the channel c of m;  B = b_inf (1 - a e),  e = exp(-beta_b r),  r = R/a
+//     w.r.t. R: b_inf beta_b e,  a: -b_inf e (1 + beta_b r),  beta_b: b_inf a r e,  b_inf: 1 - a e
+//   image         [H*W] vec4: blended colour and alpha
 //   range_image   [H*W] R, the blended range, scene units
-//   signal        [H*W] vec2: bits of the gradient by m, and its channel
-//   v_image       [H*W] vec4: by what was blended and its alpha, which this adds to
-//   v_range_image [H*W] by the blended range, which this adds to
-//   partials      [rows*3] vec4: gradient by beta_d, beta_b and b_inf, whose rows of pixels this adds to
-// A thread takes every 64th pixel of its workgroup's chunk, as in `water_backward`, after which this runs;
-// the threads' sums are added in their order, so runs are identical. Twin: core/twins/src/priors.rs
+//   signal        [H*W] vec2: bits of the gradient w.r.t. m, and the channel of m
+//   v_image       [H*W] vec4: w.r.t. the blended colour and alpha; added to
+//   v_range_image [H*W] w.r.t. the blended range; added to
+//   partials      [rows*3] vec4: gradient w.r.t. beta_d, beta_b and b_inf; the rows of pixels are added to
+// A thread takes every 64th pixel of its workgroup's chunk, as in `water_backward`, which runs before. The
+// sums of the threads are added in their order, so runs are identical. Twin: core/twins/src/priors.rs
 
 @group(0) @binding(0) var<uniform> priors: Priors;
 @group(0) @binding(1) var<uniform> water: Water;
@@ -48,7 +49,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
                 let through = exp(-beta_b * r);
                 let veil = water.b_inf * through;
                 let v_beta = (alpha * r) * veil * v_b;
-                // By the argument of the sigmoid of eq. 9; 0 where there is none, since Scale is.
+                // W.r.t. the argument of the sigmoid of eq. 9; 0 without one, because Scale is 0.
                 let s = refining_sigmoids(water, r).y;
                 let v_x = water.scale * dot(water.beta_b, v_beta) * s * (1.0 - s);
                 let v_r = v_x * water.refinement.z * water.per_unit / alpha;
@@ -69,8 +70,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         for (var k = 0u; k < 64u; k++) {
             total += sh_sums[3u * k + lane];
         }
-        // Rows of pixels come first. Groups that only fill up the last row of a folded dispatch have no
-        // place.
+        // Rows of pixels come first. Groups that only fill up the last row of a folded dispatch have no row.
         let to = 3u * id + 1u + lane;
         if lane < 2u && to < arrayLength(&partials) && id * WATER_CHUNK < pixels {
             partials[to] += total;

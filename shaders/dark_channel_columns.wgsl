@@ -1,12 +1,13 @@
 //@ import frame, water, priors, slide
 // Physics-aware dark channel, step 3 of 6: the smallest signal D of each patch, and the gradient of the loss
-// by it (SMP-UWGS eq. 13).
+// w.r.t. it (SMP-UWGS eq. 13).
 //
-//     loss = mean over pixels of lambda (max(D, 0) + negative S(max(-D, 0))),  S(x) = x^2 / 2s below s, x - s/2 above
-//   rows    [H*W] vec2: bits of the minima of rows, their columns
+//     loss = mean over pixels of lambda (max(D, 0) + negative S(max(-D, 0)))
+//     S(x) = x^2 / 2s below s, x - s/2 above
+//   rows    [H*W] vec2: bits of the row minima, and their columns
 //   truth   [H*W] packed photograph; the highest byte is the mask
-//   columns [H*W] vec2: bits of the gradient by D, and the row whose minimum D is: the first of equal ones
-// A patch whose centre is masked does not count. One thread makes eight pixels of a column.
+//   columns [H*W] vec2: bits of the gradient w.r.t. D, and the row of the minimum (the first of equal ones)
+// A patch whose centre is masked does not count. One thread computes eight pixels of a column.
 // Twin: core/twins/src/priors.rs
 
 @group(0) @binding(0) var<uniform> priors: Priors;
@@ -14,7 +15,7 @@
 @group(0) @binding(2) var<storage, read> rows: array<vec2<u32>>;
 @group(0) @binding(3) var<storage, read_write> columns: array<vec2<u32>>;
 
-// s, linear light (SeaSplat, SMP-UWGS's code): below it the negative part is a parabola.
+// s, linear light (code of SeaSplat and SMP-UWGS): below it the negative part is a parabola.
 const BEND: f32 = 0.2;
 
 fn put(at: u32, inside: bool, d: f32, row: u32) {
@@ -34,7 +35,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let runs = (priors.size.y + WINDOWS - 1u) / WINDOWS;
     let i = folded(group, groups) * 32u + lane;
     let column = i % priors.size.x;
-    // Threads behind the last work on the last run and write nothing.
+    // Excess threads work on the last run and write nothing.
     let y0 = min(i / priors.size.x, runs - 1u) * WINDOWS;
     let radius = veiled(priors.radius, arrayLength(&rows) + 256u);
     var least = no_least();

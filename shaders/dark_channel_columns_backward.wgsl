@@ -1,10 +1,10 @@
 //@ import frame, water, priors, slide
-// Physics-aware dark channel, step 4 of 6: the gradient by the minimum of each window of a row, from all
-// patches of its column that took it.
+// Physics-aware dark channel, step 4 of 6: the gradient w.r.t. the minimum of each row window, from all
+// patches of its column that selected it.
 //
-//   columns [H*W] vec2: bits of the gradient by a patch's minimum, and the row that it was taken from
-//   rows    [H*W] vec2: bits of the minimum in, of the gradient by it out; its column stays
-// Gathered in the order of rows, so runs are identical. One thread makes eight pixels of a column.
+//   columns [H*W] vec2: bits of the gradient w.r.t. a patch's minimum, and the row of that minimum
+//   rows    [H*W] vec2: in: bits of the minimum; out: bits of the gradient w.r.t. it; its column stays
+// Gathered in row order, so runs are identical. One thread computes eight pixels of a column.
 // Twin: core/twins/src/priors.rs
 
 @group(0) @binding(0) var<uniform> priors: Priors;
@@ -23,7 +23,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let runs = (priors.size.y + WINDOWS - 1u) / WINDOWS;
     let i = folded(group, groups) * 32u + lane;
     let column = i % priors.size.x;
-    // Threads behind the last work on the last run and write nothing.
+    // Excess threads work on the last run and write nothing.
     let y0 = min(i / priors.size.x, runs - 1u) * WINDOWS;
     let radius = veiled(priors.radius, arrayLength(&columns) + 256u);
     var first = vec4<f32>(0.0);

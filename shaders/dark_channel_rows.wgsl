@@ -1,10 +1,10 @@
 //@ import frame, water, priors, slide
-// Physics-aware dark channel, step 2 of 6: the smallest signal of each window of a row.
+// Physics-aware dark channel, step 2 of 6: the smallest signal of each row window.
 //
 //   signal [H*W] vec2: bits of m, channel
-//   rows   [H*W] vec2: bits of the minimum, and its column: the first of equal ones; NO_SIGNAL and NOWHERE
-//          without any
-// One thread makes eight neighbouring pixels of a row. Twin: core/twins/src/priors.rs
+//   rows   [H*W] vec2: bits of the minimum, and its column (the first of equal ones); NO_SIGNAL and NOWHERE
+//          if there is none
+// One thread computes eight neighbouring pixels of a row. Twin: core/twins/src/priors.rs
 
 @group(0) @binding(0) var<uniform> priors: Priors;
 @group(0) @binding(1) var<storage, read> signal: array<vec2<u32>>;
@@ -21,7 +21,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         @builtin(local_invocation_index) lane: u32) {
     let runs = (priors.size.x + WINDOWS - 1u) / WINDOWS;
     let i = folded(group, groups) * 32u + lane;
-    // Threads behind the last work on the last row and write nothing.
+    // Excess threads work on the last row and write nothing.
     let row = min(i / runs, priors.size.y - 1u);
     let x0 = (i % runs) * WINDOWS;
     let row_at = row * priors.size.x;

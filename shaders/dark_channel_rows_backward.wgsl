@@ -1,14 +1,14 @@
 //@ import frame, water, priors, slide
-// Physics-aware dark channel, step 5 of 6: the gradient by the signal of each pixel, from all windows of its
-// row that took it; and by the picture under water, where that is what the signal is of.
+// Physics-aware dark channel, step 5 of 6: the gradient w.r.t. the signal of each pixel, from all row windows
+// that selected it. If the signal is that of the render, also the gradient w.r.t. the underwater image.
 //
-//     v_I^c = w_c v_m for the channel c that m is;  w_c are constants in the gradient
-//   rows    [H*W] vec2: bits of the gradient by a window's minimum, and the column that it was taken from
-//   seen    [H*W] vec4: the picture under water, and alpha
-//   signal  [H*W] vec2: bits of m in, of the gradient by m out; its channel stays
-//   v_image [H*W*4] gradient by the picture under water, which this adds to
-// Gathered in the order of columns, so runs are identical. One thread makes eight neighbouring pixels of a
-// row. Runs between loss and `water_backward`. Twin: core/twins/src/priors.rs
+//     v_I^c = w_c v_m for the channel c of m;  the gradient treats w_c as constants
+//   rows    [H*W] vec2: bits of the gradient w.r.t. a window's minimum, and the column of that minimum
+//   seen    [H*W] vec4: the underwater image, and alpha
+//   signal  [H*W] vec2: in: bits of m; out: bits of the gradient w.r.t. m; its channel stays
+//   v_image [H*W*4] gradient w.r.t. the underwater image; added to
+// Gathered in column order, so runs are identical. One thread computes eight neighbouring pixels of a row.
+// Runs between the loss and `water_backward`. Twin: core/twins/src/priors.rs
 
 @group(0) @binding(0) var<uniform> priors: Priors;
 @group(0) @binding(1) var<uniform> water: Water;
@@ -33,7 +33,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         @builtin(local_invocation_index) lane: u32) {
     let runs = (priors.size.x + WINDOWS - 1u) / WINDOWS;
     let i = folded(group, groups) * 32u + lane;
-    // Threads behind the last work on the last row and write nothing.
+    // Excess threads work on the last row and write nothing.
     let row = min(i / runs, priors.size.y - 1u);
     let x0 = (i % runs) * WINDOWS;
     let row_at = row * priors.size.x;

@@ -1,18 +1,18 @@
 //@ import frame, water, medium, priors
-// Physics-aware dark channel, step 1 of 6: the direct signal of each pixel, its darkest channel (SMP-UWGS eq.
-// 12).
+// Physics-aware dark channel, step 1 of 6: the direct signal of each pixel, in its darkest channel (SMP-UWGS
+// eq. 12).
 //
 //     D^c = I^c - B^c,  m = min over c of w_c D^c,  linear light
 //     B   = b_inf (1 - a exp(-beta_b r)),  a alpha, r = R/a the expected range
-// I is the picture that was rendered, under water, or the photograph. Where the water acts on Gaussians the B
-// of what was blended is theirs, each by its own range; that of the expected range is then an approximation.
+// I is the rendered underwater image or the photograph. If the water acts on Gaussians, each Gaussian was
+// blended with the B of its own range; the B of the expected range is then an approximation.
 // Open water (alpha below LEAST_ALPHA) has no direct signal: m = 0. A pixel that is masked or not finite has
 // NO_SIGNAL.
 //   range_image [H*W] R, the blended range, scene units
-//   seen   [H*W] vec4: the picture under water, and alpha
+//   seen   [H*W] vec4: the underwater image, and alpha
 //   truth  [H*W] packed photograph, sRGB; the highest byte is the mask
-//   signal [H*W] vec2: bits of m, and which channel it is (the first of equal ones)
-// One thread a pixel. Twin: core/twins/src/priors.rs
+//   signal [H*W] vec2: bits of m, and its channel (the first of equal ones)
+// One thread per pixel. Twin: core/twins/src/priors.rs
 
 @group(0) @binding(0) var<uniform> priors: Priors;
 @group(0) @binding(1) var<uniform> water: Water;

@@ -1,17 +1,17 @@
 //@ import frame, counters
-// One step of Adam on the weights and biases of the factors by range (DBDR, SMP-UWGS eq. 9).
+// One step of Adam on the weights and biases of the range factors (DBDR, SMP-UWGS eq. 9).
 //
-//   refinement_partials [rows]  vec4: by weight and bias of the factor on beta_d, then of that on beta_b
-//   state      the four numbers with Adam's moments
-//   water [4]  vec4: the last row gets the four numbers, for who reads them as a uniform
+//   refinement_partials [rows]  vec4: w.r.t. weight and bias of the factor on beta_d, then of that on beta_b
+//   state      the four parameters with Adam's moments
+//   water [4]  vec4: the last row receives the four parameters, for kernels that read them as a uniform
 // A gradient that is not finite takes no step and is counted.
-// One workgroup; every sum has one order. While a list is too short nothing happens, as in all that follows
-// it. Twin: core/twins/src/dbdr.rs
+// One workgroup; every sum has a fixed order. After an overflow this and all later kernels do nothing.
+// Twin: core/twins/src/dbdr.rs
 
 struct Dbdr {
-    // Rows that are summed.
+    // Rows to sum.
     rows: u32,
-    // Adam: rate, and 1/(1-b1^t), 1/(1-b2^t).
+    // Adam: rate, 1/(1-b1^t), 1/(1-b2^t).
     rate: f32,
     unbias1: f32,
     unbias2: f32,
@@ -19,11 +19,11 @@ struct Dbdr {
 
 // Mirror: core/src/gpu/layout.rs.
 struct DbdrState {
-    // The four numbers, their first moments and their second moments.
+    // The four parameters, their first moments and their second moments.
     raw: vec4<f32>,
     moment1: vec4<f32>,
     moment2: vec4<f32>,
-    // Steps that were left out.
+    // Skipped steps.
     left_out: f32,
     pad: array<f32, 3>,
 }
@@ -34,7 +34,7 @@ struct DbdrState {
 @group(0) @binding(3) var<storage, read_write> state: DbdrState;
 @group(0) @binding(4) var<storage, read_write> water: array<vec4<f32>>;
 
-// The usual memories: every iteration sees the water.
+// The usual decay rates: every iteration has a gradient of the water.
 const BETA1: f32 = 0.9;
 const BETA2: f32 = 0.999;
 const EPSILON: f32 = 1e-15;

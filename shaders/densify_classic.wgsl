@@ -2,13 +2,13 @@
 // Classic density control, step 1 of 2: clones small Gaussians and splits large ones (Kerbl et al. 2023,
 // section 5).
 //
-// A clone is a copy in the same place. The parent goes on with its moments and the copy without any, so that
-// they part. A split draws two centres from the Gaussian and divides its deviations by 1.6; opacity stays.
-// The first child takes the parent's place, and neither has steps behind it. The second child, or the copy,
-// is staged for densify_place.
-//   children [count]   x: parent in the block, y: where its child is staged, z: 1 split, 0 cloned
+// A clone is a copy in the same place. The parent keeps its moments and the copy starts without any, so that
+// they move apart. A split draws two centres from the Gaussian and divides its scales by 1.6; opacity stays.
+// The first child takes the place of the parent, and both children have a step count of 0. The second child,
+// or the copy, is staged for densify_place.
+//   children [count]   x: parent in the block, y: row of its child in `staged`, z: 1 split, 0 cloned
 //   staged [n*(3+S)]   vec4: transforms, then coefficients
-// One thread a parent; random numbers are those of (seed, iteration, index among all trainable Gaussians).
+// One thread per parent. Random numbers depend on (seed, iteration, index among all trainable Gaussians).
 
 struct Divide {
     count: u32,

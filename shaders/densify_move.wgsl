@@ -1,14 +1,14 @@
 //@ import frame
-// Classic density control, step 2 of 2: copies rows of an array, whatever they hold. Used twice: from a block
-// to a staging buffer, and from there to where Gaussians were removed, in this block or another.
+// Classic density control, step 2 of 2: copies rows of an array of any type. It runs twice: from a block to a
+// staging buffer, and from there into the gaps of removed Gaussians, in this block or another.
 //
-//   moves [count]  x: row that is taken, y: row that is written
+//   moves [count]  x: source row, y: destination row
 //   rows_in, rows_out [N*words]
-// One thread a word.
+// One thread per word.
 
 struct Moves {
     count: u32,
-    // u32 a row.
+    // Number of u32 per row.
     words: u32,
     pad0: u32,
     pad1: u32,

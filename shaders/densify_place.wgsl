@@ -1,8 +1,8 @@
 //@ import frame, gaussian
-// Density control, step 2 of 2: writes staged Gaussians into a block. They have no steps behind them, so
-// moments start anew.
+// Density control, step 2 of 2: writes staged Gaussians into a block. Their step count is 0, so their moments
+// start anew.
 //
-//   placements [count]  x: entry of the block, y: where it is staged
+//   placements [count]  x: entry of the block, y: row in `staged`
 
 struct Place {
     count: u32,

@@ -1,14 +1,14 @@
 //@ import frame, gaussian
-// Classic density control: lowers every opacity to 0.01 at most and forgets its moments (Kerbl et al. 2023,
-// section 5). What views need comes back within a few of them; what they do not stays transparent and is
-// removed.
+// Classic density control: lowers every opacity to at most 0.01 and clears its moments (Kerbl et al. 2023,
+// section 5). Gaussians that views need become opaque again within a few of them. The others stay transparent
+// and are removed.
 //
-//   moments [N*row] u32: rows whose words `first` and `second` are all that Adam keeps of the opacity; a word of 0 is
-//                   zero in both forms of moments (shared/moments_*.wgsl)
-// One thread a Gaussian.
+//   moments [N*row] u32: the words `first` and `second` of a row are all that Adam keeps of the opacity;
+//                   a word of 0 means zero in both forms of moments (shared/moments_*.wgsl)
+// One thread per Gaussian.
 
 struct Reset {
-    // u32 a row.
+    // Number of u32 per row.
     row: u32,
     first: u32,
     second: u32,

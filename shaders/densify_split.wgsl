@@ -1,12 +1,13 @@
 //@ import frame, gaussian
-// Density control, step 1 of 2: splits a Gaussian along its longest axis. The first child takes its place,
-// the second is staged for where densify_place puts it: a new entry, or one whose Gaussian has faded.
+// Density control, step 1 of 2: splits a Gaussian along its longest axis. The first child takes the place of
+// the parent. The second is staged; densify_place writes it to a new entry, or to one whose Gaussian has
+// faded.
 //
-// The children lie half a (new) deviation times sqrt 2 to either side, so that their mixture keeps the
-// parent's variance along the axis: d^2 + s'^2 = s^2 with s' = d = s / sqrt 2. Opacity 1 - (1 - o)^(1/sqrt
-// 2): at each child's centre the other still adds. With no steps behind them, Adam takes neither's moments
-// for its own.
-//   splits [count]   x: which Gaussian of the block is split, y: where its second child is staged
+// The children lie at -d and +d along the axis, so that their mixture keeps the parent's variance:
+//     d^2 + s'^2 = s^2 with s' = d = s / sqrt 2
+// The opacity of a child is 1 - (1 - o)^(1/sqrt 2), because at its centre the other child adds to it. With a
+// step count of 0, neither child takes over the parent's moments.
+//   splits [count]   x: Gaussian of the block to split, y: row of its second child in `staged`
 //   staged [n*(3+S)] vec4: transforms, then coefficients
 
 struct Split {

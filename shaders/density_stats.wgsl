@@ -1,10 +1,11 @@
 //@ import frame, gaussian
-// What density control decides from, read back by the host: opacity, mean gradients and size of each
-// Gaussian; clears the sums and keeps the smoothing.
+// The inputs of density control, which the host reads back: opacity, mean gradients and size of each
+// Gaussian. Clears the sums and keeps the smoothing.
 //
-//   stats [count] vec4: opacity (0 where a parameter is not finite), mean over visits of sum |v_mean2d| (AbsGS, pixels)
-//                       and of |sum v_mean2d| (3DGS, in units of half a picture), largest deviation (scene
-//                       units)
+//   stats [count] vec4: opacity (0 if a parameter is not finite),
+//                       mean over visits of sum |v_mean2d| (AbsGS, pixels),
+//                       mean over visits of |sum v_mean2d| (3DGS, in units of half an image),
+//                       largest standard deviation (scene units)
 
 @group(0) @binding(0) var<uniform> block: Block;
 @group(0) @binding(1) var<storage, read> transforms: array<vec4<f32>>;

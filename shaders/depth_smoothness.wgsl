@@ -2,16 +2,16 @@
 // Depth smoothness that stops at edges of the photograph (SMP-UWGS eq. 14), backward.
 //
 //     loss = lambda / HW * sum over neighbours i, j in a row or column of exp(-|I_i - I_j|) |D_i - D_j|
-// with D the expected range in units of the usual viewing distance and |I_i - I_j| the mean over the
-// photograph's channels, sRGB, of the absolute difference: SeaSplat has the signed one, so that half of the
-// edges weigh more than none. Pairs count where both pixels count and have alpha above LEAST_ALPHA.
-//   image         [H*W] vec4: what was blended, and alpha
+// D is the expected range in units of the scene scale. |I_i - I_j| is the mean over the photograph's sRGB
+// channels of the absolute difference. SeaSplat uses the signed difference, which gives half of the
+// edges more weight than flat areas. Pairs count if both pixels count and have alpha above LEAST_ALPHA.
+//   image         [H*W] vec4: blended colour and alpha
 //   range_image   [H*W] R, the blended range, scene units; D = R / alpha / unit
 //   truth         [H*W] packed photograph, sRGB; the highest byte is the mask
-//   v_image       [H*W] vec4: by what was blended and its alpha, which this adds to
-//   v_range_image [H*W] by the blended range, which this adds to
-// One thread a pixel gathers from its four neighbours. Runs after `water_backward`. Twin:
-// core/twins/src/priors.rs
+//   v_image       [H*W] vec4: w.r.t. the blended colour and alpha; added to
+//   v_range_image [H*W] w.r.t. the blended range; added to
+// One thread per pixel gathers from its four neighbours. Runs after `water_backward`.
+// Twin: core/twins/src/priors.rs
 
 @group(0) @binding(0) var<uniform> priors: Priors;
 @group(0) @binding(1) var<storage, read> image: array<vec4<f32>>;
@@ -20,8 +20,8 @@
 @group(0) @binding(4) var<storage, read_write> v_image: array<vec4<f32>>;
 @group(0) @binding(5) var<storage, read_write> v_range_image: array<f32>;
 
-// Derivative by D of a pixel with colour and range of these, of its pair with pixel `j`; 0 where there is
-// none. Without branches: a CPU adapter goes through both sides of one.
+// Derivative w.r.t. D of a pixel with this colour and range, from its pair with pixel `j`; 0 if there is no
+// pair. Without branches, because a CPU adapter executes both sides.
 fn pair(is_there: bool, j: u32, own: vec3<f32>, range: f32) -> f32 {
     let alpha = image[j].a;
     let pixel = truth[j];

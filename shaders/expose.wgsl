@@ -5,7 +5,7 @@
 //   image     [H*W]      vec4: rgb, alpha
 //   exposures [views*3]  vec4: rows of [A | b]
 //   exposed   [H*W]      vec4: colour', alpha
-// One thread a pixel. Twin: core/twins/src/exposure.rs
+// One thread per pixel. Twin: core/twins/src/exposure.rs
 
 @group(0) @binding(0) var<uniform> exposure: Exposure;
 @group(0) @binding(1) var<storage, read> exposures: array<vec4<f32>>;

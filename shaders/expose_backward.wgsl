@@ -1,11 +1,10 @@
 //@ import frame, exposure
-// Carries the gradient of the loss back through the exposure of a view, and sums that of the exposure by
-// workgroup.
+// Backpropagates through the exposure of a view, and sums the gradient w.r.t. the exposure by workgroup.
 //
 //     v_colour = A^T v_colour',  v_[A | b] = sum over pixels of v_colour' (colour, 1)^T
-//   v_image  [H*W]       vec4: by colour' in, by colour out; 0 where a pixel does not count
+//   v_image  [H*W]       vec4: in: w.r.t. colour'; out: w.r.t. colour; 0 where a pixel does not count
 //   partials [groups*3]  vec4: rows of v_[A | b], summed over the workgroup's EXPOSE_CHUNK pixels
-// A thread takes every 64th pixel of its chunk; the threads' sums are added in their order, so runs are
+// A thread takes every 64th pixel of its chunk. The sums of the threads are added in their order, so runs are
 // identical. Twin: core/twins/src/exposure.rs
 
 @group(0) @binding(0) var<uniform> exposure: Exposure;
@@ -48,7 +47,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
             total += sh_sums[3u * k + lane];
         }
         let to = 3u * id + lane;
-        // Groups that only fill up the last row of a folded dispatch have no place.
+        // Groups that only fill up the last row of a folded dispatch have no row.
         if to < arrayLength(&partials) {
             partials[to] = total;
         }

@@ -1,14 +1,14 @@
 //@ import frame, counters, exposure, adam
-// One step of Adam on the exposure of a view; then the mean of all exposures is taken back to the identity.
+// One step of Adam on the exposure of a view; then the mean of all exposures is moved back to the identity.
 //
 //   partials  [groups*3]  vec4: from expose_backward
 //   exposures [views*3]   vec4: rows of [A | b]
-//   moments   [views*6]   vec4: first moments of the three rows, then second ones
-// A darker model under brighter exposures gives the same pictures, so the loss does not say how bright the
-// model is. Held out views use the identity, so the mean exposure of the training views is kept there: a step
-// of one view is taken back, in equal parts, from all of them.
-// One workgroup; every sum has one order. While a list is too short nothing happens, as in all that follows
-// it. Twin: core/twins/src/exposure.rs
+//   moments   [views*6]   vec4: first moments of the three rows, then their second moments
+// A darker model under brighter exposures gives the same images, so the loss does not determine the
+// brightness of the model. Held-out views use the identity. Therefore the mean exposure of the training views
+// is kept at the identity: the step of one view is subtracted, in equal parts, from all views.
+// One workgroup; every sum has a fixed order. After an overflow this and all later kernels do nothing.
+// Twin: core/twins/src/exposure.rs
 
 @group(0) @binding(0) var<uniform> exposure: Exposure;
 @group(0) @binding(1) var<storage, read> counters: array<u32>;

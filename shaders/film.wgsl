@@ -1,12 +1,12 @@
 //@ import frame, film, film_map
-// Multiplies a picture by the factors of its view embedding (eq. 10), bilinear between the centres of cells
+// Multiplies an image by the factors of its view embedding (eq. 10), bilinear between the centres of cells
 // (film.wgsl).
 //
 //     I_d = F * I_u
 //   image  [H*W]    vec4: rgb of I_u, alpha
 //   maps   [cells]  vec4: F of a cell
 //   filmed [H*W]    vec4: rgb of I_d, alpha
-// One thread a pixel. Twin: core/twins/src/film.rs
+// One thread per pixel. Twin: core/twins/src/film.rs
 
 @group(0) @binding(0) var<uniform> film: Film;
 @group(0) @binding(1) var<storage, read> maps: array<vec4<f32>>;

@@ -1,12 +1,12 @@
 //@ import frame, film, film_map
-// Carries the gradient by the picture that a view embedding changed back to the picture itself (eq. 10),
-// after film_cells_backward has read it.
+// Backpropagates through the view embedding to the image (eq. 10), after film_cells_backward has read the
+// gradient.
 //
-//     v_I_u = F * v_I_d + what goes through the mean of the cell
+//     v_I_u = F * v_I_d + the part through the mean of the cell
 //   maps    [cells]    vec4: F of a cell
-//   v_cells [cells*2]  vec4: by o; and by I_u of each pixel of the cell through its mean
-//   v_image [H*W]      vec4: by I_d in, by I_u out
-// One thread a pixel. Twin: core/twins/src/film.rs
+//   v_cells [cells*2]  vec4: w.r.t. o; and w.r.t. I_u of each pixel of the cell through its mean
+//   v_image [H*W]      vec4: in: w.r.t. I_d; out: w.r.t. I_u
+// One thread per pixel. Twin: core/twins/src/film.rs
 
 @group(0) @binding(0) var<uniform> film: Film;
 @group(0) @binding(1) var<storage, read> maps: array<vec4<f32>>;

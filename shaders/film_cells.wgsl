@@ -1,13 +1,13 @@
 //@ import frame, film, film_unit
-// The factors of the view embedding on each cell of a picture, from the mean colour of the cell (film.wgsl;
+// The factors of the view embedding for each cell of an image, from the mean colour of the cell (film.wgsl;
 // eq. 10).
 //
-//   image [H*W]    vec4: rgb, alpha; masked pixels count in the mean, since they are rendered as all others
-//                  are
+//   image [H*W]    vec4: rgb, alpha; the mean includes masked pixels, because they are rendered like all
+//                  others
 //   means [cells]  vec4: mean rgb, and 1 / the number of pixels
 //   maps  [cells]  vec4: factors on rgb, 0
-// One workgroup a cell; a thread takes every 64th pixel, the threads' sums are added in their order, so runs
-// are identical. Twin: core/twins/src/film.rs
+// One workgroup per cell. A thread takes every 64th pixel. The sums of the threads are added in their order,
+// so runs are identical. Twin: core/twins/src/film.rs
 
 @group(0) @binding(0) var<uniform> film: Film;
 @group(0) @binding(1) var<storage, read> weights: array<vec4<f32>>;

@@ -1,14 +1,14 @@
 //@ import frame, film, film_unit
-// Carries the gradient by the picture that a view embedding changed back to each cell (film.wgsl; eq. 10).
+// Backpropagates through the view embedding to each cell (film.wgsl; eq. 10).
 //
 //   image   [H*W]      vec4: rgb of I_u, alpha
-//   v_image [H*W]      vec4: by I_d; 0 where a pixel does not count
+//   v_image [H*W]      vec4: w.r.t. I_d; 0 where a pixel does not count
 //   means   [cells]    vec4: mean rgb, and 1 / the number of pixels
 //   maps    [cells]    vec4: F
-//   v_cells [cells*2]  vec4: by o; and by I_u of each pixel of the cell through its mean
-// One workgroup a cell, which sums the pixels whose factors it has a share in: up to the centres of its
-// neighbours. A thread takes every 64th of them; the threads' sums are added in their order, so runs are
-// identical. Twin: core/twins/src/film.rs
+//   v_cells [cells*2]  vec4: w.r.t. o; and w.r.t. I_u of each pixel of the cell through its mean
+// One workgroup per cell. It sums the pixels whose factors depend on the cell: up to the centres of its
+// neighbours. A thread takes every 64th of them. The sums of the threads are added in their order, so runs
+// are identical. Twin: core/twins/src/film.rs
 
 @group(0) @binding(0) var<uniform> film: Film;
 @group(0) @binding(1) var<storage, read> weights: array<vec4<f32>>;
@@ -22,7 +22,7 @@
 var<workgroup> sh_sums: array<vec3<f32>, 64>;
 var<workgroup> sh_v: vec3<f32>;
 
-// First pixel, and the one after the last, that part `i` may have a share in.
+// First pixel, and one past the last, whose factors may depend on part `i`.
 fn reach(i: u32, count: u32, side: u32) -> vec2<u32> {
     let first = (2u * max(i, 1u) - 1u) * side / (2u * count);
     let end = min((2u * i + 3u) * side / (2u * count) + 1u, side);

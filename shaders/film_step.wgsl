@@ -1,17 +1,19 @@
 //@ import frame, counters, film, film_unit
-// One step of Adam on the weights of the view embeddings, and on the embedding of a view (film.wgsl; eq. 10).
+// One step of Adam on the weights of the view embeddings, and on the embedding of one view
+// (film.wgsl; eq. 10).
 //
 //   means      [cells]    vec4: mean rgb, and 1 / the number of pixels
-//   v_cells    [cells*2]  vec4: by o, and what film_backward reads
-//   weights    [32*3]     vec4: of unit j its rows 2 j and 2 j + 1; their first moments 32 further on, their
-//                         second
-//   ones 64 embeddings [views*16] vec2: gamma_j, delta_j
-//   moments    [views*32] vec2: first moments of an embedding, then second ones
-// A brighter model under darker embeddings gives the same pictures, so the loss does not say how bright the
-// model is. Held out views have no embedding, so the mean embedding of the training views is kept at 0: a
-// step of one view is taken back, in equal parts, from all of them, as in expose_step. A gradient that is not
-// finite takes no step. One workgroup a hidden unit, whose numbers no other touches; every sum has one order.
-// While a list is too short nothing happens, as in all that follows it. Twin: core/twins/src/film.rs
+//   v_cells    [cells*2]  vec4: w.r.t. o, and a row that only film_backward reads
+//   weights    [32*3]     vec4: rows 2 j and 2 j + 1 of unit j; first moments 32 rows later,
+//                         second moments 64 rows later
+//   embeddings [views*16] vec2: gamma_j, delta_j
+//   moments    [views*32] vec2: first moments of an embedding, then its second moments
+// A brighter model under darker embeddings gives the same images, so the loss does not determine the
+// brightness of the model. Held-out views have no embedding. Therefore the mean embedding of the training
+// views is kept at 0: the step of one view is subtracted, in equal parts, from all views, as in expose_step.
+// A gradient that is not finite takes no step. One workgroup per hidden unit, whose parameters no other
+// workgroup writes; every sum has a fixed order. After an overflow this and all later kernels do nothing.
+// Twin: core/twins/src/film.rs
 
 @group(0) @binding(0) var<uniform> film: Film;
 @group(0) @binding(1) var<storage, read> counters: array<u32>;
@@ -21,14 +23,14 @@
 @group(0) @binding(5) var<storage, read_write> embeddings: array<vec2<f32>>;
 @group(0) @binding(6) var<storage, read_write> moments: array<vec2<f32>>;
 
-// The usual memories for the weights, which every iteration sees; shorter ones for what a view sees, as for
-// exposures.
+// The usual decay rates for the weights, which have a gradient in every iteration; smaller ones for the
+// embedding of one view, as for exposures.
 const BETA1: f32 = 0.9;
 const BETA2: f32 = 0.999;
 const VIEW_BETA1: f32 = 0.8;
 const VIEW_BETA2: f32 = 0.99;
 const EPSILON: f32 = 1e-15;
-// Rows of all weights.
+// Number of rows of the weights.
 const ROWS: u32 = 32u;
 
 var<workgroup> sh_first: array<vec4<f32>, 64>;
@@ -105,7 +107,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_index
     let views = veiled(film.views, arrayLength(&embeddings) / HIDDEN);
     for (var view = lane; view < views; view += 64u) {
         let own = select(0.0, 1.0, view == film.view);
-        // While a list is too short the step is 0.
+        // After an overflow the step is 0.
         embeddings[HIDDEN * view + j] += (share - own) * step;
     }
 }

@@ -1,7 +1,7 @@
 //@ import frame, counters, tiles
-// Counts the tiles that each visible Gaussian touches, in the order of depth.
+// Counts the tiles that each visible Gaussian touches, in depth order.
 //
-// `counts` [visible] is indexed by rank and scanned next. One thread a rank.
+// `counts` [visible] is indexed by depth rank and scanned next. One thread per rank.
 // Twin: core/twins/src/intersect.rs
 
 @group(0) @binding(0) var<uniform> frame: Frame;

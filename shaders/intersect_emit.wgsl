@@ -1,13 +1,13 @@
 //@ import frame, counters, tiles
 // Writes one entry for each tile that a visible Gaussian touches, front to back.
 //
-//   tile_keys             [intersections]  the tile, the key of the stable tile sort
-//   slots                 [intersections]  its own index, the value that the sort carries: gradients are
-//                                          written there
+//   tile_keys             [intersections]  the tile: the key of the stable tile sort
+//   slots                 [intersections]  the entry's own index, the value that the sort moves: its
+//                                          gradients are written there
 //   visible_from_slot     [intersections]
 //   segments              [visible]        (first slot, number of slots) of a visible Gaussian: contiguous
-// One thread a rank. Should rounding make this stage find fewer tiles than intersect_count did, the rest
-// is given a tile behind the last, which nobody reads.
+// One thread per rank. If rounding makes this stage find fewer tiles than intersect_count did, the remaining
+// entries get a tile after the last, which no kernel reads.
 
 @group(0) @binding(0) var<uniform> frame: Frame;
 @group(0) @binding(1) var<storage, read> counters: array<u32>;

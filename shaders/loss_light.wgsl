@@ -1,8 +1,8 @@
 //@ import frame, water, medium
-// Decodes the picture under water where Gaussians are blended in sRGB and the loss is in linear light.
+// Decodes the underwater image when Gaussians are blended in sRGB and the loss is in linear light.
 //
-//   seen [H*W] vec4: in sRGB and alpha in, in linear light and alpha out
-// One thread a pixel. Twin: `decode` in core/twins/src/water.rs
+//   seen [H*W] vec4: in: sRGB and alpha; out: linear light and alpha
+// One thread per pixel. Twin: `decode` in core/twins/src/water.rs
 
 @group(0) @binding(0) var<uniform> medium: Medium;
 @group(0) @binding(1) var<storage, read_write> seen: array<vec4<f32>>;

@@ -1,10 +1,10 @@
 //@ import frame, water, medium
-// Carries the gradient of the loss back through `loss_light`.
+// Backpropagates through `loss_light`.
 //
 //     v_s = v_l decoded'(s),  s = encoded(l)
-//   seen    [H*W] vec4: l, the picture in linear light
-//   v_image [H*W] vec4: by l in, by s out
-// One thread a pixel. Twin: `decode` in core/twins/src/water.rs
+//   seen    [H*W] vec4: l, the image in linear light
+//   v_image [H*W] vec4: in: w.r.t. l; out: w.r.t. s
+// One thread per pixel. Twin: `decode` in core/twins/src/water.rs
 
 @group(0) @binding(0) var<uniform> medium: Medium;
 @group(0) @binding(1) var<storage, read> seen: array<vec4<f32>>;

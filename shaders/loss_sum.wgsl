@@ -1,5 +1,5 @@
 //@ import frame, ssim
-// Adds the workgroups' sums of one channel in index order to the log of losses; the first channel clears its
+// Adds the workgroup sums of one channel, in index order, to the log of losses. The first channel resets its
 // entry.
 //
 // One thread, so that the order is the same in every run.

@@ -3,47 +3,52 @@
 //@ variant project_backward_f32 gather=gather_slots+gradient_of_slots moments=moments_f32
 //@ variant project_backward_bands gather=gradient_of_bands moments=moments_compact
 //@ variant project_backward_bands_f32 gather=gradient_of_bands moments=moments_f32
-// From the gradients of the splats to new Gaussians: backward projection and Adam in one step.
+// From the gradients of the splats to updated Gaussians: backward projection and Adam in one step.
 //
-// No gradient of a parameter is ever stored. One thread a visible Gaussian of the block: it sums the
-// gradients of its slots in order (gradient_of_*.wgsl), carries them back through the projection (adjoint of
-// project_forward, including the direction of the spherical harmonics and the range), and takes one step of
-// Adam (adam.wgsl, moments_*.wgsl) with the number of its own steps. Gaussians that no pixel could see are
-// not touched. Where Adam acts on all Gaussians in every iteration (3DGS), the second moment of one that a
-// share p of the views sees averages zeros too, so its steps are 1 / sqrt(p) larger for each view that sees
-// it; so are they here (`lr_scale`), with p the share of the trainable Gaussians that this view sees, but for
-// scales and the higher bands. Under water the constant colour has a scale of its own (water.wgsl). A
-// Gaussian without any gradient in this view is not touched either. On top, per visit: weights on opacity and
-// scale and noise on the means, as 3DGS-MCMC (Kheradmand et al. 2024) has them for every Gaussian in every
-// iteration; the weights are divided by the number of visible ones. Under water there is one more, on the
-// opacity of what hangs before the scene. Twins: core/twins/src/project_backward.rs, core/twins/src/adam.rs
+// Gradients of parameters are never stored. One thread per visible Gaussian of the block. It sums the
+// gradients of its slots in order (gradient_of_*.wgsl). It backpropagates them through the projection: the
+// adjoint of project_forward, including the direction of the spherical harmonics and the range. Then it takes
+// one step of Adam (adam.wgsl, moments_*.wgsl) with the step count of this Gaussian. Gaussians without any
+// gradient in this view are not changed.
+//
+// Learning rates: 3DGS applies Adam to all Gaussians in every iteration. If a share p of the views sees a
+// Gaussian, its second moment there also averages zeros. Its steps are then 1 / sqrt(p) larger for each view
+// that sees it. `lr_scale` does the same here, with p the share of the trainable Gaussians that this view
+// sees. It does not apply to scales and the higher bands. Under water the constant colour has a factor of its
+// own (water.wgsl).
+//
+// Regularisation, per visit: weights on opacity and scale and noise on the means. 3DGS-MCMC (Kheradmand et
+// al. 2024) applies them to every Gaussian in every iteration; here the weights are divided by the number of
+// visible Gaussians. Under water there is a further weight on the opacity of Gaussians that float in front of
+// the scene.
+// Twins: core/twins/src/project_backward.rs, core/twins/src/adam.rs
 
 struct Step {
-    // Learning rates of Adam; that of the means is in scene units.
+    // Learning rates of Adam; the rate of the means is in scene units.
     means_lr: f32,
     quats_lr: f32,
     scales_lr: f32,
     opacity_lr: f32,
-    // The same of the constant colour and of the higher bands.
+    // Learning rates of the constant colour and of the higher bands.
     sh_dc_lr: f32,
     sh_rest_lr: f32,
-    // Weights of opacity and of scale.
+    // Weights on opacity and on scale.
     opacity_reg: f32,
     scale_reg: f32,
-    // Factor of the noise on the means, in deviations of the Gaussian.
+    // Factor of the noise on the means, in standard deviations of the Gaussian.
     mean_noise: f32,
-    // Under water: weight of colours above white, and weight of opacity nearer to the camera than
-    // clear_range.
+    // Under water: weight of colours above white, and weight on the opacity of Gaussians nearer to the camera
+    // than clear_range.
     overwhite_weight: f32,
     floater_weight: f32,
     pad: f32,
     seed: u32,
-    // 1 writes raw gradients in place of steps, where moments are f32 (tests): [v_mean, v_logit], [v_quat],
-    // [v_log_scale].
+    // 1 writes raw gradients instead of taking steps, if moments are f32 (tests): [v_mean, v_logit],
+    // [v_quat], [v_log_scale].
     gradients_only: u32,
-    // Trainable Gaussians in all blocks; 0 leaves the rates as they are (tests).
+    // Trainable Gaussians in all blocks; 0 leaves the rates unscaled (tests).
     trainable: u32,
-    // Range up to which this view has nothing but water before it, world units; 0 where nobody knows.
+    // Range up to which this view sees nothing but water, scene units; 0 if unknown.
     clear_range: f32,
 }
 
@@ -57,7 +62,7 @@ struct Step {
 @group(0) @binding(13) var<storage, read_write> density_sums: array<vec4<f32>>;
 @group(0) @binding(15) var<uniform> water: Water;
 
-// Largest factor on the rates of a view that sees little of the model.
+// Largest factor on the rates in a view that sees a small part of the model.
 const MAX_LR_SCALE: f32 = 8.0;
 
 @compute @workgroup_size(64)
@@ -72,8 +77,9 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let g1 = gathered.sum.b;
     let g2 = gathered.sum.c;
     let gradients_only = keeps_gradients();
-    // Hidden, or only where pixels do not count. The weights alone would be a gradient too, and Adam takes
-    // every gradient for one of full size: what other views need would fade and scatter.
+    // The Gaussian is hidden, or only visible in pixels that do not count. The weights alone would be a
+    // gradient too, and Adam would scale it to full size: Gaussians that other views need would fade and
+    // scatter.
     if !gradients_only && all(g2.xyz == vec3<f32>(0.0)) && g1.z == 0.0 && g1.w == 0.0 {
         return;
     }
@@ -87,9 +93,9 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let rot = rotation(quat);
     let bare_scales = exp(t2.xyz);
     var scales = bare_scales;
-    // Of density control and smoothing; see the end.
+    // Sums of density control, and smoothing; see the end.
     let seen = density_sums[i];
-    // Deviations before over after the 3D filter of Mip-Splatting.
+    // Ratio of the scales before and after the 3D filter of Mip-Splatting.
     var shares = vec3<f32>(1.0);
     if seen.z > 0.0 {
         scales = widened(bare_scales, seen.z);
@@ -100,10 +106,10 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let m = p.centre;
     let inv_z = 1.0 / m.z;
 
-    // Opacity: that of the splat is opacity times the shares, and times r where the 2D filter is on.
+    // Opacity of the splat: opacity times the shares, and times r if the 2D filter is on.
     let share = shares.x * shares.y * shares.z;
     var v_logit = g1.y * share * opacity * (1.0 - opacity);
-    // Gradient by the logarithm of what opacity is multiplied with.
+    // Gradient w.r.t. the logarithm of the factor on opacity.
     var v_log_factor = g1.y * share * opacity;
 
     // Conic to covariance: dL/dS = -C G C with C the conic and G its gradient as a symmetric matrix.
@@ -169,7 +175,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let v_v = -frame.focal.y * inv_z * dot(v_ty, frame.view_z.xyz);
     var v_centre = vec3<f32>(0.0);
     v_centre.z = -inv_z * (dot(v_tx, p.t_x) + dot(v_ty, p.t_y));
-    // u = x/z where it is not clamped.
+    // u = x/z unless clamped.
     let v_ratio = p.free * vec2<f32>(v_u, v_v);
     v_centre += inv_z * vec3<f32>(v_ratio, -dot(v_ratio, m.xy) * inv_z);
     // mean2d = f x/z + principal point.
@@ -196,10 +202,9 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         rgb += k.x * v0.xyz + k.y * vec3<f32>(v0.w, v1.xy) + k.z * vec3<f32>(v1.zw, v2.x) + k.w * v2.yzw;
     }
     var v_blended = g2.xyz;
-    // How much faster the constant colour must move so that what is seen of it moves as fast as it does in
-    // air. Not the higher bands: they would take what a noisy photograph has for what its direction shows,
-    // several times over. Their rate is another one only in clear water (water.clear_harmonics), where
-    // step.sh_rest_lr has that.
+    // Factor on the rate of the constant colour, so that the seen colour moves as fast as in air. It does not
+    // apply to the higher bands: they would fit the noise of a photograph as view dependence, several times
+    // over. Their rate differs only in clear water (water.clear_harmonics), through step.sh_rest_lr.
     var colour_lr_scale = vec3<f32>(1.0);
     let medium = veiled(frame.medium, arrayLength(&flags) + 6u);
     if medium != MEDIUM_NONE {
@@ -213,18 +218,18 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
             v_blended *= through;
         }
         v_blended *= select(decoded_slope(clear), vec3<f32>(1.0), medium >= MEDIUM_AS_SHOWN);
-        // d/ds of y (s - 1)^2 above white, as a mean over channels and visible Gaussians.
+        // d/ds of y (s - 1)^2 above white, averaged over channels and visible Gaussians.
         let above = max(clear - 1.0, vec3<f32>(0.0));
         v_blended += (step.overwhite_weight * 2.0 / (3.0 * f32(max(counters[VISIBLE], 1u)))) * above;
     }
     let v_rgb = select(vec3<f32>(0.0), v_blended, rgb > vec3<f32>(0.0));
 
-    // Adam's state: number of steps of this Gaussian.
+    // Adam's step count of this Gaussian.
     let count = bitcast<u32>(t2.w) + 1u;
     var lr_scale = 1.0;
     let trainable = veiled(step.trainable, arrayLength(&flags));
     if trainable > 0u {
-        // Trainable Gaussians come first, so this is how many of them the view sees.
+        // Trainable Gaussians come first, so this is the number of them that the view sees.
         var seen_count = counters[VISIBLE];
         if trainable < frame.gaussians {
             seen_count = flags[trainable];
@@ -232,7 +237,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         lr_scale = min(sqrt(f32(trainable) / f32(max(seen_count, 1u))), MAX_LR_SCALE);
     }
     let pace = pace_of(count);
-    // Not for scales and the higher bands: their rates are as large as a step may be
+    // Scales and the higher bands are not scaled: their rates are as large as a step may be
     // (core/twins/src/adam.rs).
     let rates = vec4<f32>(lr_scale, lr_scale, 1.0, lr_scale)
         * vec4<f32>(step.means_lr, step.quats_lr, step.scales_lr, step.opacity_lr);
@@ -247,7 +252,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
             let value = sh_coeffs[n];
             var gradient: vec4<f32>;
             var rate = sh_rates.yyyy;
-            // Four coefficients of three channels lie in three vectors.
+            // Four coefficients of three channels fill three vectors.
             if part == 0u {
                 gradient = vec4<f32>(k.x * v_rgb, k.y * v_rgb.x);
                 let own = vec4<f32>(dot(value.xyz, v_rgb), value.w * v_rgb.x, 0.0, 0.0);
@@ -287,8 +292,8 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let new1 = t1 - transform_step(i, 1u, v_quat, rates.yyyy, pace);
     let new2 = t2.xyz - transform_step(i, 2u, vec4<f32>(v_log_scale, 0.0), rates.zzzz, pace).xyz;
     if lr_scale * step.mean_noise > 0.0 {
-        // Noise of the shape of the Gaussian, for those that are nearly transparent (gate of 3DGS-MCMC, eq.
-        // 8).
+        // Noise of the shape of the Gaussian, for Gaussians that are nearly transparent (gate of 3DGS-MCMC,
+        // eq. 8).
         let gate = 1.0 / (1.0 + exp(-100.0 * (0.005 - opacity)));
         // Keyed by the index among all trainable Gaussians: they come first, block after block.
         let bits = random_bits(step.seed, STREAM_MEAN_NOISE, block.base + i, frame.iteration);
@@ -296,8 +301,9 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         let radius = sqrt(-2.0 * log(vec2<f32>(uniform_open(bits.x), uniform_open(bits2.x))));
         let turn = 6.2831853 * vec2<f32>(uniform_open(bits.y), uniform_open(bits2.y));
         let normal = vec3<f32>(radius.x * cos(turn.x), radius.x * sin(turn.x), radius.y * cos(turn.y));
-        // Deviations times a standard normal. The reference code of the paper multiplies by the covariance,
-        // whose unit is an area: in a scene in metres it throws Gaussians of half a metre across hundreds.
+        // Standard deviations times a standard normal. The code of the paper multiplies by the covariance,
+        // whose unit is an area: in a scene in metres it throws Gaussians of half a metre across hundreds of
+        // metres.
         let shaped = rot * (bare_scales * normal);
         let moved = new0.xyz + (gate * lr_scale * step.mean_noise) * shaped;
         new0 = vec4<f32>(moved, new0.w);
@@ -305,9 +311,9 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     transforms[3u * i] = new0;
     transforms[3u * i + 1u] = new1;
     transforms[3u * i + 2u] = vec4<f32>(new2, bitcast<f32>(count));
-    // For density control: sum of the pixel gradient, visits, then the smoothing (smoothing.wgsl), sum of the
-    // gradient by the centre in units of half a picture: that of 3DGS, whose pixel coordinates run from -1
-    // to 1.
+    // For density control: sum of the pixel gradient, visits, the smoothing (smoothing.wgsl), and the sum of
+    // the gradient w.r.t. the centre. The last is in units of half an image, as in 3DGS, whose pixel
+    // coordinates run from -1 to 1.
     let by_centre = length(0.5 * vec2<f32>(frame.size) * g0.xy);
     density_sums[i] = vec4<f32>(seen.x + g1.w, seen.y + 1.0, seen.z, seen.w + by_centre);
 }

@@ -1,15 +1,15 @@
 //@ import frame, gaussian, projection, harmonics, colour, water
 // Projects the visible Gaussians of one block into the view (Zwicker et al. 2002; Kerbl et al. 2023).
 //
-//   projected           [visible*3]  vec4: (mean2d xy, conic a, b), (conic c, opacity, range, E), (rgb, 0)
-//                                    pixels, 1/pixel^2, scene units; E = ln(255 opacity): alpha >= 1/255 <=> sigma <= E
-//                                    opacity with the compensation of the low-pass where frame.mip_filter is
-//                                    on
-//                                    rgb as it is blended: through the water where frame.medium says so
-//   depth_keys          [visible]    bits of z above those of NEAR: 30 bits, in the order of z
-//   order               [visible]    its own index, the value that the depth sort carries
-//   gaussian_from_visible [visible]  index inside the block
-// One thread a Gaussian of the block. Twin: core/twins/src/project_forward.rs
+//   projected             [visible*3]  vec4: (mean2d xy, conic a, b), (conic c, opacity, range, E), (rgb, 0)
+//                                      pixels, 1/pixel^2, scene units
+//                                      E = ln(255 opacity): alpha >= 1/255 <=> sigma <= E
+//                                      opacity includes the low-pass compensation if frame.mip_filter is on
+//                                      rgb is the value to blend: through the water if frame.medium says so
+//   depth_keys            [visible]    bits of z minus those of NEAR: 30 bits, ordered like z
+//   order                 [visible]    the entry's own index, the value that the depth sort moves
+//   gaussian_from_visible [visible]    index inside the block
+// One thread per Gaussian of the block. Twin: core/twins/src/project_forward.rs
 
 @group(0) @binding(0) var<uniform> frame: Frame;
 @group(0) @binding(1) var<uniform> block: Block;
@@ -29,7 +29,8 @@
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
         @builtin(local_invocation_index) lane: u32) {
     let i = folded(group, groups) * 64u + lane;
-    // After the scan, flags hold the number of visible Gaussians before each; a step marks a visible one.
+    // After the scan, flags hold the number of visible Gaussians before each; an increment marks a visible
+    // one.
     if i >= block.count || counters[1] == 0u {
         return;
     }

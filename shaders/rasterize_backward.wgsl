@@ -1,19 +1,20 @@
 //@ import frame, splat, exchange, sums
 // Gradients of the blending, for every intersection.
 //
-// With F = sum of v . (what a splat adds) and `rem` what lies behind splat i, including the background:
+// With F = sum of v . (contribution of a splat), and `rem` the contributions behind splat i, including the
+// background:
 //     dF/d alpha_i = T_i (c_i . v_rgb + range_i v_range) - rem_i / (1 - alpha_i)
-// The rays are replayed front to back from the forward's result, so no per-pixel list is kept.
+// The rays are replayed front to back, starting from the forward result, so no per-pixel list is stored.
 //
-//   v_image   [H*W]   vec4: gradient of the loss by rgb and by alpha
-//   v_range_image [H*W]  gradient of the loss by the range image
-//   slot_gradients [intersections*3] vec4, at the slot where the intersection was emitted, so that a splat's rows
-//             are contiguous and are summed in one order: no atomics anywhere
-//             (v_mean2d xy, v_conic a, b), (v_conic c, v_opacity, v_range, sum |v_mean2d|), (v_rgb, sum of
-//             weights)
-// Work is laid out as in rasterize_forward. A thread sums a splat over its own eight pixels, the tile's
-// threads are summed in their order (exchange_*.wgsl).
-// Every slot of a tile is written, also those behind the last splat that any pixel needed.
+//   v_image   [H*W]   vec4: gradient of the loss w.r.t. rgb and alpha
+//   v_range_image [H*W]  gradient of the loss w.r.t. the range image
+//   slot_gradients [intersections*3] vec4: (v_mean2d xy, v_conic a, b), (v_conic c, v_opacity, v_range,
+//             sum |v_mean2d|), (v_rgb, sum of weights)
+//             at the slot where the intersection was emitted, so that the rows of a splat are contiguous and
+//             are summed in a fixed order, without atomics
+// The work is distributed as in rasterize_forward. A thread sums a splat over its own eight pixels; then the
+// threads of the tile are summed in their order (sums_*.wgsl).
+// Every slot of a tile is written, including those after the last splat that any pixel needed.
 // Twin: core/twins/src/rasterize_backward.rs
 
 @group(0) @binding(0) var<uniform> frame: Frame;
@@ -54,7 +55,7 @@ struct Pixel {
     rem: f32,
 }
 
-// Zeros outside the picture.
+// Zeros outside the image.
 fn load_pixel(column: u32, row: u32) -> Pixel {
     if column >= frame.size.x || row >= frame.size.y {
         return Pixel(0.0, vec3<f32>(0.0), 0.0, 0.0);
@@ -63,7 +64,7 @@ fn load_pixel(column: u32, row: u32) -> Pixel {
     let v = v_image[at];
     let seen = image[at];
     let v_range = v_range_image[at];
-    // dot(seen.rgb, v) holds the background's share T bg . v already; alpha = 1 - T.
+    // dot(seen.rgb, v) already includes the background's share T bg . v; alpha = 1 - T.
     return Pixel(1.0, v.xyz, v_range, dot(seen.xyz, v.xyz) + range_image[at] * v_range - (1.0 - seen.w) * v.w);
 }
 
@@ -101,7 +102,7 @@ fn unblend(splat: Splat) -> Splat {
     let worth_b = p2.x * vr_b + p2.y * vg_b + p2.z * vb_b + p1.z * vd_b;
     rem_a -= w_a * worth_a;
     rem_b -= w_b * worth_b;
-    // Zero where the splat was not blended, and where the cap on alpha acts on opacity and shape.
+    // Zero if the splat was not blended, or if MAX_ALPHA capped its alpha.
     let va_a = select(vec4<f32>(0.0), T_a * worth_a - rem_a / left_a, (w_a > vec4<f32>(0.0)) & (raw_a <= vec4<f32>(MAX_ALPHA)));
     let va_b = select(vec4<f32>(0.0), T_b * worth_b - rem_b / left_b, (w_b > vec4<f32>(0.0)) & (raw_b <= vec4<f32>(MAX_ALPHA)));
     T_a -= w_a;

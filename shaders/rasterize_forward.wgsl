@@ -2,14 +2,15 @@
 // Blends the splats of a tile, front to back (Kerbl et al. 2023, eq. 3).
 //
 //     alpha = min(MAX_ALPHA, opacity exp(-sigma)),  C += alpha T c,  R += alpha T range,  T *= 1 - alpha
-// A splat below 1/255 is skipped; the one that would take T below MIN_TRANSMITTANCE ends the ray unblended.
+// A splat with alpha below 1/255 is skipped. The first splat that would bring T below MIN_TRANSMITTANCE is
+// not blended and ends the ray.
 //
 //   image   [H*W]   vec4: rgb over the background, alpha = 1 - T
 //   range_image [H*W]  sum of alpha T range, scene units
-//   tile_ends [tiles]  how many of the tile's splats any pixel needed: where the backward stops
-// One workgroup a tile of TILE x TILE pixels; a thread owns eight pixels of a column (LANES = TILE * TILE /
-// 8), so what a splat costs to fetch is shared by eight pixels. How threads share splats is in
-// exchange_*.wgsl. Twin: core/twins/src/rasterize_forward.rs
+//   tile_ends [tiles]  number of the tile's splats that any pixel needed: the backward pass stops there
+// One workgroup per tile of TILE x TILE pixels. A thread owns eight pixels of a column (LANES = TILE * TILE /
+// 8), so eight pixels share the cost of fetching a splat. How threads share splats is in exchange_*.wgsl.
+// Twin: core/twins/src/rasterize_forward.rs
 
 @group(0) @binding(0) var<uniform> frame: Frame;
 @group(0) @binding(1) var<storage, read> projected: array<vec4<f32>>;
@@ -34,10 +35,10 @@ var<private> b_a: vec4<f32>;
 var<private> b_b: vec4<f32>;
 var<private> range_a: vec4<f32>;
 var<private> range_b: vec4<f32>;
-// 1 while a ray goes on.
+// 1 until the ray ends, then 0.
 var<private> on_a: vec4<f32>;
 var<private> on_b: vec4<f32>;
-// How many splats were needed by any of the thread's pixels.
+// Number of splats that any of the thread's pixels needed.
 var<private> end: u32;
 
 fn blend(splat: Splat, number: u32) {
@@ -70,7 +71,7 @@ fn blend(splat: Splat, number: u32) {
     b_b += w_b * p2.z;
     range_a += w_a * p1.z;
     range_b += w_b * p1.z;
-    // What a ray that has ended is left with does not change: w is 0 there.
+    // The transmittance of an ended ray does not change: w is 0 there.
     T_a -= w_a;
     T_b -= w_b;
     let w = w_a + w_b;
@@ -109,7 +110,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     range_a = vec4<f32>(0.0);
     range_b = vec4<f32>(0.0);
     end = 0u;
-    // Pixels outside the picture end at once.
+    // Pixels outside the image end immediately.
     let inside = column < frame.size.x;
     on_a = select(vec4<f32>(0.0), vec4<f32>(1.0), (y_a < vec4<f32>(f32(frame.size.y))) & vec4<bool>(inside));
     on_b = select(vec4<f32>(0.0), vec4<f32>(1.0), (y_b < vec4<f32>(f32(frame.size.y))) & vec4<bool>(inside));
@@ -126,7 +127,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         blend(shared_splat(5u), number + 5u);
         blend(shared_splat(6u), number + 6u);
         blend(shared_splat(7u), number + 7u);
-        // Now and then: has every ray of the tile ended?
+        // Every fourth batch: stop if all rays of the tile have ended.
         if (number / BATCH) % 4u == 3u {
             let on = on_a + on_b;
             if !any_thread(lane, on.x + on.y + on.z + on.w > 0.0) {

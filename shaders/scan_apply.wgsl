@@ -1,7 +1,7 @@
 //@ import frame, counters
-// Exclusive prefix sum, step 3 of 3: `values` becomes its exclusive prefix sum in place.
+// Exclusive prefix sum, step 3 of 3: replaces `values` by its exclusive prefix sum, in place.
 //
-// One workgroup a chunk, 16 consecutive counts a thread. The total stays in `sums[chunks].
+// One workgroup per chunk, 16 consecutive counts per thread. The total stays in `sums[chunks]`.
 
 @group(0) @binding(0) var<uniform> which: vec4<u32>;
 @group(0) @binding(1) var<storage, read> counters: array<u32>;

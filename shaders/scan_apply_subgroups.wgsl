@@ -1,6 +1,6 @@
 //@ import frame, counters
-// As scan_apply, for adapters with subgroups: a lane takes four consecutive counts, neighbouring lanes
-// neighbouring fours.
+// As scan_apply, for adapters with subgroups. A lane takes four consecutive counts; neighbouring lanes take
+// neighbouring groups of four.
 
 @group(0) @binding(0) var<uniform> which: vec4<u32>;
 @group(0) @binding(1) var<storage, read> counters: array<u32>;

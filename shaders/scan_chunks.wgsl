@@ -1,8 +1,8 @@
 //@ import frame, counters
 // Exclusive prefix sum, step 1 of 3: the sum of every chunk of 1024 counts.
 //
-// Integers, so the result does not depend on any order. One workgroup a chunk, 16 consecutive counts a
-// thread. `values` [n], n = counters[which.x]; `sums` [chunks + 1].
+// The sums are integers, so the result does not depend on the order. One workgroup per chunk, 16 consecutive
+// counts per thread. `values` [n], n = counters[which.x]; `sums` [chunks + 1].
 // Twin: a running sum (core/tests).
 
 @group(0) @binding(0) var<uniform> which: vec4<u32>;

@@ -1,7 +1,7 @@
 //@ import frame, counters
-// Exclusive prefix sum, step 2 of 3: scans the sums of the chunks in place; the total lands behind the last.
-// What does not fit a u32 stays at its end, so that a total which is too large never looks small enough for a
-// list.
+// Exclusive prefix sum, step 2 of 3: scans the sums of the chunks in place and writes the total after the
+// last. The addition saturates at the largest u32, so that a total that is too large never looks small enough
+// for a list.
 //
 // One workgroup of 64 threads; each takes a run of consecutive sums.
 

@@ -1,14 +1,15 @@
 //@ import frame, gaussian
-// The 3D filter of Mip-Splatting (Yu et al. 2024, section 5.1): how far each Gaussian is smoothed, so that it
-// is no finer than the finest sampling of it by the training views.
+// The 3D filter of Mip-Splatting (Yu et al. 2024, section 5.1): the smoothing of each Gaussian that makes it
+// no finer than its finest sampling by the training views.
 //
-// A view samples a Gaussian at depth z with f / z samples a scene unit, f the larger focal length. It counts
-// where the centre is in front of it and inside the picture or 15 % of its size outside (their code). The
-// variance of the filter is 0.2 / (greatest rate)^2; a Gaussian that no view samples is not smoothed.
-//   views  [V*5] vec4: rows of world to camera (rotation xyz, translation w), (focal xy, principal xy), (size
-//          xy, 0, 0)
-//   density_sums [N]   vec4: deviation of the filter in z, scene units
-// One thread a Gaussian.
+// A view samples a Gaussian at depth z with f / z samples per scene unit, f the larger focal length. The view
+// counts if the centre is in front of it and inside the image, or outside by at most 15 % of its size (as in
+// their code). The variance of the filter is 0.2 / (largest rate)^2. A Gaussian that no view samples is not
+// smoothed.
+//   views  [V*5] vec4: rows of world to camera (rotation xyz, translation w), (focal xy, principal xy),
+//                      (size xy, 0, 0)
+//   density_sums [N]   vec4: standard deviation of the filter in z, scene units
+// One thread per Gaussian.
 
 // The value of the paper.
 const VARIANCE: f32 = 0.2;

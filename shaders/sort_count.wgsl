@@ -1,9 +1,10 @@
 //@ import frame, counters, digits
-// Stable radix sort, step 1 of 2 (a scan of the histogram lies between): counts each digit of a chunk.
+// Stable radix sort, step 1 of 2: counts each digit of a chunk. A scan of the histogram follows before step
+// 2.
 //
-// Six bits a pass. One workgroup a chunk of 2048 keys, 64 consecutive keys a thread, a column of the
-// histogram a thread: no atomics, so the order is the same in every run. `histogram` [64 * chunks],
-// digit-major. which: x counter of the number of keys, y shift of the digit.
+// Six bits per pass. One workgroup per chunk of 2048 keys, 64 consecutive keys per thread, one column of the
+// histogram per thread. There are no atomics, so the order is the same in every run. `histogram` [64 *
+// chunks], digit-major. which: x counter of the number of keys, y shift of the digit.
 // Twin: slice::sort_by_key, which is stable (core/tests).
 
 @group(0) @binding(0) var<uniform> which: vec4<u32>;

@@ -1,8 +1,8 @@
 //@ import frame, counters, subgroups, digits_subgroups
 // As sort_count, for adapters with subgroups: neighbouring lanes take neighbouring keys.
 //
-// One workgroup a chunk of 2048 keys; the lanes with one digit find each other by ballots. Columns of the
-// histogram belong to subgroups.
+// One workgroup per chunk of 2048 keys. Ballots find the lanes that share a digit. Columns of the histogram
+// belong to subgroups.
 
 @group(0) @binding(0) var<uniform> which: vec4<u32>;
 @group(0) @binding(1) var<storage, read> counters: array<u32>;

@@ -1,7 +1,8 @@
 //@ import frame, counters, digits
-// Stable radix sort, step 2 of 2: moves keys and values to where the scanned histogram puts them.
+// Stable radix sort, step 2 of 2: moves keys and values to the positions given by the scanned histogram.
 //
-// Work is laid out as in sort_count, so a thread meets its keys in the order in which it counted them.
+// The work is distributed as in sort_count, so a thread visits its keys in the order in which it counted
+// them.
 
 @group(0) @binding(0) var<uniform> which: vec4<u32>;
 @group(0) @binding(1) var<storage, read> counters: array<u32>;
@@ -22,7 +23,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     }
     let own = keys_of_thread(chunk, lane, n);
     count_digits(lane, own);
-    // From how many there are to where the next one goes.
+    // From counts to the position of the next key.
     for (var bin = lane; bin < SORT_BINS; bin += 32u) {
         var next = histogram[bin * chunks + chunk];
         for (var i = 0u; i < 32u; i++) {

@@ -1,6 +1,6 @@
 //@ import frame, counters, subgroups, digits_subgroups
-// As sort_scatter, for adapters with subgroups. Work is laid out as in sort_count_subgroups, so keys keep
-// their order: subgroups in theirs, rounds of a subgroup in theirs, lanes in theirs.
+// As sort_scatter, for adapters with subgroups. The work is distributed as in sort_count_subgroups, so keys
+// keep their order: by subgroup, then by round, then by lane.
 
 @group(0) @binding(0) var<uniform> which: vec4<u32>;
 @group(0) @binding(1) var<storage, read> counters: array<u32>;
@@ -20,7 +20,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let chunks = groups_for(n, SORT_CHUNK);
     let s = Subgroup(index, count, size, lane);
     count_digits(thread, chunk, n, s);
-    // From how many there are to where the next one goes.
+    // From counts to the position of the next key.
     if thread < SORT_BINS && chunk < chunks {
         var next = histogram[thread * chunks + chunk];
         for (var i = 0u; i < count; i++) {
@@ -33,7 +33,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     for (var round = 0u; round < ROUNDS; round++) {
         let k = key_of(chunk, round, n, s);
         let to = sh_digits[k.slot] + ones(k.peers & lanes_before(lane));
-        // All have read where their digit goes before the first lane moves it on.
+        // All lanes have read the position of their digit before the first lane advances it.
         workgroupBarrier();
         if k.valid {
             if k.first {

@@ -2,13 +2,14 @@
 //@ variant ssim_columns light=light_srgb
 //@ variant ssim_columns_linear light=water+light_linear
 // SSIM, step 2 of 4: smooths along columns, evaluates SSIM (Wang et al. 2004, eq. 13) and its derivatives,
-// sums the loss.
+// and sums the loss.
 //
-//     SSIM = (2 m_x m_y + C1)(2 s_xy + C2) / ((m_x^2 + m_y^2 + C1)(s_xx + s_yy + C2)),  C1 = .01^2, C2 = .03^2
-//   partials [H*W]   vec4: dSSIM/d m_x, d s_xx, d s_xy at each window's centre (times the mask), 0
-//   sums_out [groups] loss of this channel by workgroup: (1-w) keep |x - y| + w (1 - keep SSIM), before the division
-//                      by 3HW
-// One thread makes eight pixels of a column. Twin: core/twins/src/loss.rs
+//     SSIM = (2 m_x m_y + C1)(2 s_xy + C2) / ((m_x^2 + m_y^2 + C1)(s_xx + s_yy + C2))
+//     C1 = .01^2, C2 = .03^2
+//   partials [H*W]    vec4: dSSIM/d m_x, d s_xx, d s_xy at each window's centre (times the mask), 0
+//   sums_out [groups] loss of this channel by workgroup, before the division by 3HW:
+//                     (1-w) keep |x - y| + w (1 - keep SSIM)
+// One thread computes eight pixels of a column. Twin: core/twins/src/loss.rs
 
 @group(0) @binding(0) var<uniform> loss: LossParams;
 @group(0) @binding(1) var<storage, read> image: array<vec4<f32>>;
@@ -29,7 +30,7 @@ fn input(k: u32) -> vec4<f32> {
     return inside * moments[u32(clamp(row, 0, i32(loss.size.y) - 1)) * loss.size.x + column];
 }
 
-// SSIM and its derivatives at one pixel, from the window's moments; gives the pixel's loss.
+// Writes the derivatives of SSIM at one pixel, from the window's moments; returns the pixel's loss.
 fn finish(j: u32, inside: bool, moment: vec4<f32>) -> f32 {
     if !inside {
         return 0.0;
@@ -48,7 +49,7 @@ fn finish(j: u32, inside: bool, moment: vec4<f32>) -> f32 {
     let keep = select(1.0, mask_of(pixel), loss.masked != 0u);
     let by_sxy = 2.0 * n1 * inv;
     let by_sxx = -ssim / d2;
-    // s_xx and s_xy hold m_x too: s_xx = E[xx] - m_x^2, s_xy = E[xy] - m_x m_y.
+    // s_xx and s_xy also contain m_x: s_xx = E[xx] - m_x^2, s_xy = E[xy] - m_x m_y.
     let by_mx = 2.0 * my * n2 * inv - 2.0 * mx * ssim / d1 - 2.0 * mx * by_sxx - my * by_sxy;
     partials[at] = vec4<f32>(keep * by_mx, keep * by_sxx, keep * by_sxy, 0.0);
     let l1 = abs(image[at][loss.channel] - truth_channel(pixel, loss.channel));
@@ -62,7 +63,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let id = folded(group, groups);
     let i = id * 32u + lane;
     column = i % loss.size.x;
-    // Threads behind the last work on the last run and count nothing.
+    // Excess threads work on the last run and add nothing.
     y0 = min(i / loss.size.x, runs - 1u) * RUN;
     smooth_run();
     let left = select(0u, loss.size.y - y0, i < runs * loss.size.x);

@@ -1,11 +1,11 @@
 //@ import ssim, frame, window, light
 //@ variant ssim_columns_backward light=light_srgb
 //@ variant ssim_columns_backward_linear light=water+light_linear
-// SSIM, step 4 of 4: smooths along columns and gives the gradient of the loss by the render.
+// SSIM, step 4 of 4: smooths along columns and computes the gradient of the loss w.r.t. the render.
 //
 //     v_x = keep ((1-w) sign(x - y) - w (G*dm_x + 2 x G*ds_xx + y G*ds_xy)) / (3HW)
-//   v_image [H*W*4]  this channel of vec4 (rgb, alpha); the alpha entry stays as it was
-// One thread makes eight pixels of a column. Twin: core/twins/src/loss.rs
+//   v_image [H*W*4]  this channel of vec4 (rgb, alpha); the alpha entry is unchanged
+// One thread computes eight pixels of a column. Twin: core/twins/src/loss.rs
 
 @group(0) @binding(0) var<uniform> loss: LossParams;
 @group(0) @binding(1) var<storage, read> image: array<vec4<f32>>;
@@ -41,7 +41,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let runs = (loss.size.y + RUN - 1u) / RUN;
     let i = folded(group, groups) * 32u + lane;
     column = i % loss.size.x;
-    // Threads behind the last work on the last run and write nothing.
+    // Excess threads work on the last run and write nothing.
     y0 = min(i / loss.size.x, runs - 1u) * RUN;
     smooth_run();
     let left = select(0u, loss.size.y - y0, i < runs * loss.size.x);

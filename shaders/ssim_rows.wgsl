@@ -1,12 +1,11 @@
 //@ import ssim, frame, window, light
 //@ variant ssim_rows light=light_srgb
 //@ variant ssim_rows_linear light=water+light_linear
-// SSIM, step 1 of 4: one channel of render and truth, and their products, smoothed along rows.
+// SSIM, step 1 of 4: smooths one channel of render and photograph, and their products, along rows.
 //
-//   moments [H*W]  vec4: x, y, xx + yy, xy (x the render, y the truth, 0..1, both in the light of the loss;
-//                  both 0
-//                    where masked). SSIM needs the squares only as their sum.
-// One thread makes eight neighbouring pixels of a row. Twin: core/twins/src/loss.rs
+//   moments [H*W]  vec4: x, y, xx + yy, xy; x the render, y the photograph, 0..1, both in the light of the
+//                  loss; both 0 where masked. SSIM needs the squares only as their sum.
+// One thread computes eight neighbouring pixels of a row. Twin: core/twins/src/loss.rs
 
 @group(0) @binding(0) var<uniform> loss: LossParams;
 @group(0) @binding(1) var<storage, read> image: array<vec4<f32>>;
@@ -38,7 +37,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         @builtin(local_invocation_index) lane: u32) {
     let runs = (loss.size.x + RUN - 1u) / RUN;
     let i = folded(group, groups) * 32u + lane;
-    // Threads behind the last work on the last row and write nothing.
+    // Excess threads work on the last row and write nothing.
     let row = min(i / runs, loss.size.y - 1u);
     x0 = (i % runs) * RUN;
     row_at = row * loss.size.x;

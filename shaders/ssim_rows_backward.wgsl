@@ -1,7 +1,7 @@
 //@ import ssim, frame, window
-// SSIM, step 3 of 4: the derivatives smoothed along rows. The window is symmetric, so its adjoint is itself.
+// SSIM, step 3 of 4: smooths the derivatives along rows. The window is symmetric, so it is its own adjoint.
 //
-//   partials [H*W] vec4 in, smoothed [H*W] vec4 out. One thread makes eight neighbouring pixels of a row.
+//   partials [H*W] vec4 in, smoothed [H*W] vec4 out. One thread computes eight neighbouring pixels of a row.
 // Twin: core/twins/src/loss.rs
 
 @group(0) @binding(0) var<uniform> loss: LossParams;
@@ -28,7 +28,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         @builtin(local_invocation_index) lane: u32) {
     let runs = (loss.size.x + RUN - 1u) / RUN;
     let i = folded(group, groups) * 32u + lane;
-    // Threads behind the last work on the last row and write nothing.
+    // Excess threads work on the last row and write nothing.
     let row = min(i / runs, loss.size.y - 1u);
     x0 = (i % runs) * RUN;
     row_at = row * loss.size.x;

@@ -1,7 +1,8 @@
 //@ import frame, counters
-// Where the intersections of each tile begin and end in the sorted list.
+// The range of intersections of each tile in the sorted list.
 //
-// `ranges` [tiles + 1] is cleared before. One thread an intersection; neighbours that differ mark a border.
+// `ranges` [tiles + 1] is cleared before. One thread per intersection; neighbours with different tiles mark a
+// border.
 
 @group(0) @binding(0) var<storage, read> counters: array<u32>;
 @group(0) @binding(1) var<storage, read> tile_keys: array<u32>;

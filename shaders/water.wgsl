@@ -1,16 +1,16 @@
 //@ import frame, water, medium
-// The picture under water, and encoded as its photograph is, between blending and loss (SMP-UWGS eq. 7).
+// The underwater image in the light of the loss, between blending and loss (SMP-UWGS eq. 7).
 //
-//     per Gaussian: what was blended is under water already; open water, b_inf, shows where a ray went on
-//     per pixel:    I = Ja exp(-beta_d r) + b_inf (1 - a exp(-beta_b r)) with Ja what was blended, in linear light, a its
-//                   alpha, r = R/a,
-//                   over black b_inf (a - a exp(-beta_b r)) in the place of the second term;
-//                   beta_d and beta_b times the factors of eq. 9 at r where the run has them
-//   with b_inf times its factors along the ray of the pixel where it changes with direction
-//   image [H*W] vec4: what was blended over black, and alpha
+//     per Gaussian: the blended image is under water already; open water (b_inf) shows where alpha < 1
+//     per pixel:    I = Ja exp(-beta_d r) + b_inf (1 - a exp(-beta_b r))
+//                   Ja the blended image in linear light, a its alpha, r = R/a
+//                   over black: the second term is b_inf (a - a exp(-beta_b r))
+//                   with eq. 9, beta_d and beta_b are multiplied by its factors at r
+//     If b_inf changes with direction, it is multiplied by its factors along the ray of the pixel.
+//   image [H*W] vec4: colour blended over black, and alpha
 //   range_image [H*W]  R, the blended range, scene units
-//   seen  [H*W] vec4: the picture in the light of the loss, and alpha
-// One thread a pixel. Twin: core/twins/src/water.rs
+//   seen  [H*W] vec4: the image in the light of the loss, and alpha
+// One thread per pixel. Twin: core/twins/src/water.rs
 
 @group(0) @binding(0) var<uniform> medium: Medium;
 @group(0) @binding(1) var<uniform> water: Water;

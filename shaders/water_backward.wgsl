@@ -1,21 +1,23 @@
 //@ import frame, water, medium
-// Carries the gradient of the loss back through `water`, and sums what of it goes to the nine numbers.
+// Backpropagates through `water`, and sums the gradient w.r.t. the water parameters.
 //
 //   truth    [H*W]       packed photograph, sRGB; the highest byte is the mask
-//   v_image  [H*W]       vec4: by the picture in; by what was blended and its alpha out
-//   v_range_image [H*W]  by the blended range; 0 where the water acts on Gaussians
-//   partials [rows*3]    vec4: gradient by beta_d, beta_b and b_inf, summed over the workgroup's WATER_CHUNK
-//                        pixels
-//   refinement_partials [rows]  vec4: the same by the two weights and biases of eq. 9; one row where there
-//                               are none
-// With m the factors of eq. 9 at r, coefficients are m beta, so beta has m times their gradient, m the sum
-// over channels of beta times it, and the sigmoids go back to weight, bias and, through z, to r. Alpha has a
-// gradient of its own (eq. 15): where the photograph is open water no Gaussian shall take its place, and
-// elsewhere open water shall not shine through what is there, else J is too dark by what shines through.
-// Where the view has a map (core/src/water/open_water), the map tells which is which, and says nothing where
-// it does not know; else the colour tells. Where b_inf changes with direction, its gradient is that by b_inf
-// along the ray times the factor. A thread takes every 64th pixel of its chunk; the threads' sums are added
-// in their order, so runs are identical. Twin: core/twins/src/water.rs
+//   v_image  [H*W]       vec4: in: w.r.t. the image; out: w.r.t. the blended colour and alpha
+//   v_range_image [H*W]  w.r.t. the blended range; 0 if the water acts on Gaussians
+//   partials [rows*3]    vec4: gradient w.r.t. beta_d, beta_b and b_inf, summed over the workgroup's
+//                        WATER_CHUNK pixels
+//   refinement_partials [rows]  vec4: the same w.r.t. the two weights and biases of eq. 9; one row if unused
+// With m the factors of eq. 9 at r, the coefficients are m beta. So beta receives m times their gradient, and
+// m receives the sum over channels of beta times it. The sigmoids pass the gradient on to weight, bias and,
+// through z, to r.
+// Alpha has a gradient of its own (eq. 15). Where the photograph shows open water, no Gaussian shall take its
+// place. Elsewhere, open water shall not shine through the surface, because J would be too dark by that
+// light.
+// If the view has a ray map (core/src/water/open_water), the map decides which case applies, and cells of
+// unknown kind get no such gradient. Without a map the colour decides.
+// If b_inf changes with direction, its gradient is that w.r.t. b_inf along the ray times the factor.
+// A thread takes every 64th pixel of its chunk. The sums of the threads are added in their order, so runs are
+// identical. Twin: core/twins/src/water.rs
 
 @group(0) @binding(0) var<uniform> medium: Medium;
 @group(0) @binding(1) var<uniform> water: Water;
@@ -29,15 +31,15 @@
 @group(0) @binding(9) var<uniform> frame: Frame;
 @group(0) @binding(10) var<storage, read> map: array<u32>;
 
-// Alpha below which a surface is drawn up no harder.
+// Alpha below which the pull on a surface grows no further.
 const THIN: f32 = 0.05;
-// A pixel at the edge of open water is open up to this share of the distance from which it is a surface: in
-// between nothing tells.
+// A pixel at the edge of open water is open up to this share of edge_distance, from which on it is a surface.
+// In between, nothing is decided.
 const SURELY: f32 = 0.6;
 
 var<workgroup> sh_sums: array<vec4<f32>, 256>;
 
-// The cell of the map that pixel `i` lies in.
+// The map cell that contains pixel `i`.
 fn cell_of(i: u32) -> u32 {
     let columns = max(frame.size.x, 1u);
     let column = (i % columns) * medium.map_columns / columns;
@@ -45,8 +47,9 @@ fn cell_of(i: u32) -> u32 {
     return map[min(row * medium.map_columns + column, arrayLength(&map) - 1u)];
 }
 
-// Gradient by the range `r` of pixel `i`: towards the sparse points of its cell, which lie on surfaces, from
-// far off them. Through water a surface that few views see may hang anywhere before its place, or not at all.
+// Gradient w.r.t. the range `r` of pixel `i`: pulls a range that is far off towards the sparse points of its
+// cell, which lie on surfaces. Through water, a surface that few views see may float anywhere in front of its
+// place, or be missing.
 fn by_range(i: u32, pixel: u32, r: f32) -> f32 {
     let is_masked = (pixel >> 24u) != 255u && veiled(medium.masked, arrayLength(&truth)) != 0u;
     if is_masked || veiled(medium.map_columns, arrayLength(&map)) == 0u {
@@ -58,10 +61,10 @@ fn by_range(i: u32, pixel: u32, r: f32) -> f32 {
     return select(0.0, medium.range_weight * sign(off) / max(r, 1e-6), counts);
 }
 
-// Gradient of eq. 15 by the alpha of pixel `i`, whose photograph is `pixel`: up where there is a surface,
-// down in open water. What must be covered is drawn up the harder the thinner it is, as by a barrier: where
-// next to no light comes through the water, nothing else holds a thin surface against what makes Gaussians
-// smaller and fainter.
+// Gradient of eq. 15 w.r.t. the alpha of pixel `i`, whose photograph is `pixel`: up on a surface, down in
+// open water. The pull on a surface grows as its alpha falls, like a barrier. Where almost no light comes
+// through the water, nothing else protects a thin surface from the terms that make Gaussians smaller and
+// fainter.
 fn by_alpha(i: u32, pixel: u32, alpha: f32, b_inf: vec3<f32>) -> f32 {
     if (pixel >> 24u) != 255u && veiled(medium.masked, arrayLength(&truth)) != 0u {
         return 0.0;
@@ -119,7 +122,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
                 let veil = b_inf * exp(-beta_b * r);
                 let v_d = -r * own * through * v;
                 let v_b = (r * pixel.a) * veil * v;
-                // By the arguments of the sigmoids; 0 where there are none, since Scale is.
+                // W.r.t. the arguments of the sigmoids; 0 without them, because Scale is 0.
                 let sigmoids = refining_sigmoids(water, r);
                 let v_m = vec2<f32>(dot(water.beta_d, v_d), dot(water.beta_b, v_b));
                 let v_x = water.scale * v_m * sigmoids * (1.0 - sigmoids);
@@ -160,7 +163,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
             total += sh_sums[4u * k + lane];
         }
         let to = 3u * id + lane;
-        // Groups that only fill up the last row of a folded dispatch have no place.
+        // Groups that only fill up the last row of a folded dispatch have no row.
         if lane < 3u && to < arrayLength(&partials) && id < medium.gaussian_rows {
             partials[to] = total;
         }

@@ -1,15 +1,18 @@
 //@ import frame, counters, gaussian, harmonics, colour, water, medium, gather
 //@ variant water_gradients gather=colour_gradient_of_slots
 //@ variant water_gradients_bands gather=colour_gradient_of_bands
-// What of the gradients of the visible Gaussians of one block goes to the nine numbers, where the water acts
-// on Gaussians.
+// Gradients w.r.t. the water parameters through the visible Gaussians of one block, when the water acts on
+// Gaussians.
 //
-//     by beta_d: -r J exp(-beta_d r) v,  by beta_b: r b_inf exp(-beta_b r) v,  by b_inf: (1 - exp(-beta_b r)) v
-// with v the gradient by the light of a Gaussian, from that by what is blended for it
+//     w.r.t. beta_d: -r J exp(-beta_d r) v
+//     w.r.t. beta_b: r b_inf exp(-beta_b r) v
+//     w.r.t. b_inf:  (1 - exp(-beta_b r)) v
+// v is the gradient w.r.t. the linear light of a Gaussian, from that w.r.t. its blended value
 // (colour_gradient_of_*.wgsl).
-//   partials [rows*3] vec4: by beta_d, beta_b and b_inf, summed over the workgroup's 64 Gaussians in their order
-// One thread a Gaussian of the block, whether it is visible or not, so that the sums are the same in bands of
-// tiles. Runs before project_backward moves the Gaussians. Twin: core/twins/src/water.rs
+//   partials [rows*3] vec4: w.r.t. beta_d, beta_b and b_inf, summed over the workgroup's 64 Gaussians,
+//                     in their order
+// One thread per Gaussian of the block, visible or not, so that the sums are the same in bands of tiles. Runs
+// before project_backward moves the Gaussians. Twin: core/twins/src/water.rs
 
 @group(0) @binding(0) var<uniform> frame: Frame;
 @group(0) @binding(1) var<uniform> block: Block;
@@ -31,7 +34,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     var by_d = vec3<f32>(0.0);
     var by_b = vec3<f32>(0.0);
     var by_inf = vec3<f32>(0.0);
-    // While a list is too short there is nothing to sum.
+    // After an overflow there is nothing to sum.
     if i < block.count && counters[OVERFLOW] == 0u {
         let by_blended = v_colour(i);
         if any(by_blended != vec3<f32>(0.0)) {
@@ -55,7 +58,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         for (var k = 0u; k < 64u; k++) {
             total += sh_sums[3u * k + lane];
         }
-        // Blocks need not begin at a multiple of 64, so each may have one row more than its Gaussians fill.
+        // Blocks need not begin at a multiple of 64, so each may have one row more than it fills.
         let to = 3u * (medium.gaussian_rows + block.base / 64u + block.index + id) + lane;
         if id * 64u < block.count && to < arrayLength(&partials) {
             partials[to] = total;

@@ -1,27 +1,29 @@
 //@ import frame, counters, water, medium
-// One step of Adam on the unconstrained numbers of the water (SMP-UWGS eq. 8), from the sums of pixels and
+// One step of Adam on the unconstrained water parameters (SMP-UWGS eq. 8), from the sums of pixels and
 // Gaussians.
 //
 //     beta = softplus(p) / unit, b_inf = sigmoid(p)
-//   partials [rows*3] vec4: by beta_d, beta_b and b_inf
-//   state             the p with Adam's moments, and the gradients that were gathered
-//   water    [4]      vec4: the nine numbers, for who reads them as a uniform; what else is in it stays
-// The squares of the nine weigh on them (eq. 16). A gradient that is not finite takes no step and is counted.
-// While WaterParamPredict decides the water, the gradients are gathered for it and the nine stay. One
-// workgroup; every sum has one order. While a list is too short nothing happens, as in all that follows it.
+//   partials [rows*3] vec4: w.r.t. beta_d, beta_b and b_inf
+//   state             the p with Adam's moments, and the accumulated gradients
+//   water    [4]      vec4: the water parameters, for kernels that read them as a uniform; the rest is
+//                     unchanged
+// The squared water parameters are penalised (eq. 16). A gradient that is not finite takes no step and is
+// counted. While WaterParamPredict sets the water, the gradients are accumulated for it and the parameters
+// stay.
+// One workgroup; every sum has a fixed order. After an overflow this and all later kernels do nothing.
 // Twin: core/twins/src/water.rs
 
 // Mirror: core/src/gpu/layout.rs.
 struct WaterState {
-    // The nine p, their first moments and their second moments.
+    // The unconstrained parameters p, their first moments and their second moments.
     raw: array<f32, 9>,
     moment1: array<f32, 9>,
     moment2: array<f32, 9>,
-    // Steps that were left out.
+    // Skipped steps.
     left_out: f32,
-    // Share of the rate that each p has: the surer the prior is, the less.
+    // Factor on the learning rate of each p: the more certain the prior, the smaller.
     shares: array<f32, 9>,
-    // Sums of gradients by the p, and the number of iterations in them.
+    // Sums of gradients w.r.t. p, and the number of iterations in them.
     gathered: array<f32, 9>,
     gathered_iterations: f32,
 }
@@ -32,7 +34,7 @@ struct WaterState {
 @group(0) @binding(3) var<storage, read_write> state: WaterState;
 @group(0) @binding(4) var<storage, read_write> water: array<vec4<f32>>;
 
-// The usual memories: every iteration sees the water.
+// The usual decay rates: every iteration has a gradient of the water.
 const BETA1: f32 = 0.9;
 const BETA2: f32 = 0.999;
 const EPSILON: f32 = 1e-15;

@@ -1,6 +1,6 @@
-// Adam (Kingma and Ba 2015) on the Gaussians that a view sees. Twin: core/twins/src/adam.rs
+// Adam (Kingma and Ba 2015) for the Gaussians that a view sees. Twin: core/twins/src/adam.rs
 
-// Shorter memories than usual: counted are the views that see a Gaussian, and those are few
+// Smaller decay rates than usual: steps are counted per Gaussian, and few views see each
 // (core/twins/src/adam.rs).
 const BETA1: f32 = 0.8;
 const BETA2: f32 = 0.99;
@@ -9,7 +9,7 @@ const EPSILON: f32 = 1e-15;
 struct Pace {
     // 1/(1-b1^t), 1/(1-b2^t).
     unbias: vec2<f32>,
-    // No step was taken yet: whatever the moments hold is that of another Gaussian.
+    // No step was taken yet: the stored moments belong to another Gaussian.
     fresh: bool,
 }
 

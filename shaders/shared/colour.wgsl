@@ -1,7 +1,7 @@
 // The colour of a Gaussian from its spherical harmonics (3DGS). Needs frame, harmonics and the names block,
 // sh_coeffs.
 
-// 0.5 + sum of coefficient * basis(direction), before it is clamped at 0.
+// 0.5 + sum of coefficient * basis(direction), before the clamp at 0.
 fn colour(i: u32, direction: vec3<f32>) -> vec3<f32> {
     let degree = veiled(frame.sh_degree, arrayLength(&sh_coeffs));
     let b = basis(degree, direction);

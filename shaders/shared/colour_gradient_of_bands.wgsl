@@ -1,4 +1,4 @@
-// The gradient by what is blended for a Gaussian, from the sums that add_band_gradients left.
+// The gradient w.r.t. the blended colour of a Gaussian, from the sums that add_band_gradients wrote.
 
 @group(0) @binding(5) var<storage, read> band_gradients: array<vec4<f32>>;
 

@@ -1,5 +1,5 @@
-// The gradient by what is blended for a Gaussian, from its slots. Needs frame, counters, gaussian and the
-// names block, counters, flags.
+// The gradient w.r.t. the blended colour of a Gaussian, from its slots. Needs frame, counters, gaussian and
+// the names block, counters, flags.
 
 @group(0) @binding(6) var<storage, read> segments: array<vec2<u32>>;
 @group(0) @binding(7) var<storage, read> slot_gradients: array<vec4<f32>>;

@@ -1,4 +1,4 @@
-// Counts that a frame makes on the device. Mirror: core/src/gpu/layout.rs, `counter`.
+// Counts that a frame computes on the device. Mirror: core/src/gpu/layout.rs, `counter`.
 
 const GAUSSIANS: u32 = 0u;
 const VISIBLE: u32 = 1u;
@@ -11,7 +11,7 @@ const FAILED_AT: u32 = 6u;
 const NEEDED_VISIBLE: u32 = 7u;
 const NEEDED_INTERSECTIONS: u32 = 8u;
 
-// Workgroups that the indirect dispatches need: three u32 each, from `args[3 * slot].
+// Workgroups of the indirect dispatches: three u32 each, from `args[3 * slot]`.
 const ARGS_VISIBLE: u32 = 0u;
 const ARGS_VISIBLE_SCAN: u32 = 1u;
 const ARGS_DEPTH_SORT: u32 = 2u;
@@ -21,7 +21,7 @@ const ARGS_TILE_SCAN: u32 = 5u;
 const ARGS_INTERSECT: u32 = 6u;
 const ARGS_BLOCK: u32 = 8u;
 
-// Items a workgroup of each kind takes.
+// Items per workgroup of each kind.
 const GROUP: u32 = 64u;
 const SCAN_CHUNK: u32 = 1024u;
 const SORT_CHUNK: u32 = 2048u;

@@ -1,6 +1,6 @@
-// How both stages of the sort meet the keys of a chunk where there are subgroups: 256 threads, and a subgroup
-// takes consecutive keys, as many at a time as it has lanes. Needs counters.wgsl, subgroups.wgsl and the
-// names which, keys.
+// How both stages of the sort visit the keys of a chunk on adapters with subgroups. There are 256 threads; a
+// subgroup takes consecutive keys, as many at a time as it has lanes. Needs counters.wgsl, subgroups.wgsl and
+// the names which, keys.
 
 // [32 subgroups at most][64 digits]: how many keys of the digit a subgroup has.
 var<workgroup> sh_digits: array<u32, 2048>;
@@ -19,17 +19,17 @@ struct Key {
     key: u32,
     // Entry of sh_digits.
     slot: u32,
-    // Lanes with a key of the same digit; none where there is no key.
+    // Lanes whose key has the same digit; empty if there is no key.
     peers: vec4<u32>,
-    // Whether there is a key, and whether this lane is the first that has one of the digit.
+    // Whether there is a key, and whether this is the first lane with its digit.
     valid: bool,
     first: bool,
 }
 
-// All threads must be here.
+// All threads must reach this call.
 fn key_of(chunk: u32, round: u32, n: u32, s: Subgroup) -> Key {
     let at = chunk * SORT_CHUNK + s.index * (SORT_CHUNK / s.count) + round * s.size + s.lane;
-    // A chunk behind the last begins behind the last key.
+    // A chunk after the last begins after the last key.
     let valid = at < n;
     var key = 0u;
     if valid {
@@ -40,7 +40,7 @@ fn key_of(chunk: u32, round: u32, n: u32, s: Subgroup) -> Key {
     return Key(at, key, s.index * SORT_BINS + digit, peers, valid, valid && first_lane(peers) == s.lane);
 }
 
-// The first of the lanes with one digit counts for all: no atomics.
+// The first lane with a digit counts for all lanes with that digit: no atomics.
 fn count_digits(thread: u32, chunk: u32, n: u32, s: Subgroup) {
     for (var i = thread; i < 2048u; i += 256u) {
         sh_digits[i] = 0u;
@@ -51,7 +51,7 @@ fn count_digits(thread: u32, chunk: u32, n: u32, s: Subgroup) {
         if k.first {
             sh_digits[k.slot] += ones(k.peers);
         }
-        // Of a workgroup: on Vulkan a barrier of a subgroup does not order workgroup memory.
+        // A workgroup barrier, because on Vulkan a subgroup barrier does not order workgroup memory.
         workgroupBarrier();
     }
 }

@@ -1,4 +1,4 @@
-// The one place that folds a count into a dispatch: two dimensions, at most 32768 groups in x. Needs
+// The one place that folds a count into a dispatch of two dimensions, with at most 32768 groups in x. Needs
 // counters.wgsl and the name args.
 
 fn put(slot: u32, groups: u32) {

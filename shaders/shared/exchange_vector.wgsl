@@ -1,7 +1,7 @@
 // How the threads of a tile share splats when they are the eight lanes of one vector: by broadcasts. For CPU
-// adapters with subgroups of eight (lavapipe): a load from memory costs such an adapter one instruction a
-// lane and number, a broadcast from a known lane costs one for all. Measured against exchange_workgroup.wgsl:
-// `kernels` in bench/history.jsonl.
+// adapters with subgroups of eight (lavapipe). On such an adapter a load from memory costs one instruction
+// per lane and number, and a broadcast from a known lane costs one for all lanes. Measured against
+// exchange_workgroup.wgsl: `kernels` in bench/history.jsonl.
 
 const BATCH: u32 = 8u;
 
@@ -15,7 +15,7 @@ fn share_splats(lane: u32, first: u32, last: u32) {
     }
 }
 
-// Callers give a constant, so that only one case is left.
+// Callers pass a constant, so that the compiler keeps a single case.
 fn from_lane(v: vec4<f32>, i: u32) -> vec4<f32> {
     switch i {
         case 0u: { return subgroupBroadcast(v, 0u); }

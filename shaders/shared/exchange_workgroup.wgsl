@@ -1,13 +1,13 @@
-// How the threads of a tile share splats: through workgroup memory. Any adapter.
-// The other way, with the same functions, is exchange_vector.wgsl.
+// How the threads of a tile share splats: through workgroup memory, on any adapter. exchange_vector.wgsl has
+// the same functions for vector adapters.
 
 const BATCH: u32 = 8u;
 
 var<workgroup> sh_splats: array<vec4<f32>, 24>;
 var<workgroup> sh_votes: array<u32, LANES>;
 
-// Takes the splats of `projected` that `first` and the following entries of the tile's list name; those from
-// `last` on have opacity 0, so they are never blended.
+// Loads the splats for the entries of the tile's list from `first` on. Entries from `last` on get opacity 0,
+// so they are never blended.
 fn share_splats(lane: u32, first: u32, last: u32) {
     workgroupBarrier();
     for (var i = lane; i < 3u * BATCH; i += LANES) {
@@ -24,7 +24,7 @@ fn shared_splat(i: u32) -> Splat {
     return Splat(sh_splats[3u * i], sh_splats[3u * i + 1u], sh_splats[3u * i + 2u]);
 }
 
-// Whether any thread of the tile says yes.
+// Whether `yes` holds in any thread of the tile.
 fn any_thread(lane: u32, yes: bool) -> bool {
     workgroupBarrier();
     sh_votes[lane] = select(0u, 1u, yes);
@@ -36,7 +36,7 @@ fn any_thread(lane: u32, yes: bool) -> bool {
     return votes > 0u;
 }
 
-// The greatest of the threads' numbers.
+// The largest of the threads' numbers.
 fn greatest(lane: u32, number: u32) -> u32 {
     workgroupBarrier();
     sh_votes[lane] = number;

@@ -2,13 +2,13 @@
 // core/src/gpu/layout.rs.
 
 struct Exposure {
-    // Pixels of the picture.
+    // Pixels of the image.
     pixels: u32,
-    // Index of the view, and number of all views.
+    // Index of the view, and number of views.
     view: u32,
     views: u32,
     pad0: u32,
-    // Adam: rate, and 1/(1-b1^t), 1/(1-b2^t) with t the number of steps of this view, this one included.
+    // Adam: rate, 1/(1-b1^t), 1/(1-b2^t); t counts the steps of this view, including this one.
     rate: f32,
     unbias1: f32,
     unbias2: f32,

@@ -1,4 +1,4 @@
-// The factors of a view embedding on a pixel: bilinear between the centres of cells. Needs film and the names
+// The factors of a view embedding at a pixel: bilinear between the centres of cells. Needs film and the names
 // film, maps.
 
 fn factor_at(x: u32, y: u32) -> vec3<f32> {
@@ -11,7 +11,7 @@ fn factor_at(x: u32, y: u32) -> vec3<f32> {
     let b = maps[above + next.x].xyz;
     let c = maps[below + across.part].xyz;
     let d = maps[below + next.x].xyz;
-    // Differences, so that factors of 1 give 1 to the bit.
+    // Interpolated by differences, so that factors of 1 give exactly 1.
     let top = a + across.share * (b - a);
     let bottom = c + across.share * (d - c);
     return top + down.share * (bottom - top);

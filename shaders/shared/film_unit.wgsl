@@ -14,7 +14,7 @@ fn unit_of(j: u32, mean: vec3<f32>) -> Unit {
     return Unit(plain, plain * gain + embedding.y, gain);
 }
 
-// What of a unit the embedding adds to the outputs, before W2.
+// What the embedding adds to the output of a unit, before W2.
 fn added(unit: Unit) -> f32 {
     return max(unit.modulated, 0.0) - max(unit.plain, 0.0);
 }

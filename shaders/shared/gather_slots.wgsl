@@ -5,7 +5,7 @@
 @group(0) @binding(6) var<storage, read> segments: array<vec2<u32>>;
 @group(0) @binding(7) var<storage, read> slot_gradients: array<vec4<f32>>;
 
-// Index among the visible ones of the block's thread-th visible Gaussian; `none` behind its last.
+// Visible id of the `thread`-th visible Gaussian of the block; NONE after the last.
 fn visible_of_thread(thread: u32) -> u32 {
     let start = flags[block.base];
     var end = counters[VISIBLE];
@@ -17,7 +17,7 @@ fn visible_of_thread(thread: u32) -> u32 {
 
 const NONE: u32 = 0xffffffffu;
 
-// `sum` and the slots of a segment, in their order.
+// `start` plus the slots of a segment, added in their order.
 fn add_slots(segment: vec2<u32>, start: Splat) -> Splat {
     var sum = start;
     for (var s = segment.x; s < segment.x + segment.y; s++) {

@@ -4,18 +4,18 @@
 //   sh_coeffs  [N*S]  vec4: coefficients k of channel c at flat index 3*k + c, S = 3*ceil(K/4), padding is 0
 
 struct Block {
-    // Index of the first Gaussian of this block among all.
+    // Index of the first Gaussian of this block among all Gaussians.
     base: u32,
     count: u32,
     index: u32,
-    // vec4 a Gaussian in sh_coeffs.
+    // Number of vec4 per Gaussian in sh_coeffs.
     sh_stride: u32,
 }
 
-// Gaussians under one culling bound. Mirror: core/src/gpu/bounds.rs.
+// Gaussians per culling bound. Mirror: core/src/gpu/bounds.rs.
 const CHUNK: u32 = 4096u;
-// Deviations with the 3D filter of Mip-Splatting (Yu et al. 2024, eq. 8) on top, of deviation `smoothing`.
-// Opacity goes with the product of old over new ones, so that the integral stays.
+// Scales widened by the 3D filter of Mip-Splatting (Yu et al. 2024, eq. 8), of standard deviation
+// `smoothing`. Opacity is multiplied by the product of old over new scales, which preserves the integral.
 fn widened(scales: vec3<f32>, smoothing: f32) -> vec3<f32> {
     return sqrt(scales * scales + smoothing * smoothing);
 }
@@ -24,7 +24,7 @@ fn sigmoid(x: f32) -> f32 {
     return 1.0 / (1.0 + exp(-x));
 }
 
-// Rotation of a unit quaternion w x y z; columns.
+// Rotation matrix of a unit quaternion w x y z; columns.
 fn rotation(q: vec4<f32>) -> mat3x3<f32> {
     let w = q.x; let x = q.y; let y = q.z; let z = q.w;
     return mat3x3<f32>(

@@ -1,6 +1,6 @@
-// What project_backward starts from where the picture is rendered in bands: one thread a Gaussian of the
-// block, and the sums that add_band_gradients left. Flags and counters are those of the whole picture. Needs
-// frame, counters, gaussian, splat.
+// Input of project_backward when the image is rendered in bands: one thread per Gaussian of the block, and
+// the sums that add_band_gradients wrote. Flags and counters are those of the whole image. Needs frame,
+// counters, gaussian, splat.
 
 @group(0) @binding(5) var<storage, read> band_gradients: array<vec4<f32>>;
 
@@ -12,7 +12,7 @@ struct Gathered {
 }
 
 fn gather(thread: u32) -> Gathered {
-    // A band that overflowed leaves the sums unfinished.
+    // If a band overflowed, the sums are incomplete.
     if thread >= block.count || counters[OVERFLOW] != 0u {
         return Gathered(NONE, Splat(vec4<f32>(0.0), vec4<f32>(0.0), vec4<f32>(0.0)));
     }

@@ -1,8 +1,8 @@
-// What project_backward starts from where the whole picture is one band: one thread a visible Gaussian. Needs
+// Input of project_backward when the whole image is one band: one thread per visible Gaussian. Needs
 // gather_slots.
 
 struct Gathered {
-    // Index inside the block; NONE where there is nothing to do.
+    // Index inside the block; NONE if there is nothing to do.
     i: u32,
     sum: Splat,
 }

@@ -74,7 +74,7 @@ fn basis_vec(b: Basis, i: u32) -> vec4<f32> {
     }
 }
 
-// Groups of four coefficients (three vec4 of memory) that a degree touches: 1, 1, 3, 4.
+// Groups of four coefficients (three vec4 of memory) that a degree uses: 1, 1, 3, 4.
 fn coefficient_groups(degree: u32) -> u32 {
     return select(select(4u, 3u, degree == 2u), 1u, degree < 2u);
 }

@@ -1,49 +1,49 @@
-// How the water is composed and stepped in one iteration. Mirror: core/src/gpu/layout.rs. Needs water.
+// How the water is applied and stepped in one iteration. Mirror: core/src/gpu/layout.rs. Needs water.
 
 struct Medium {
-    // Pixels of the picture.
+    // Pixels of the image.
     pixels: u32,
-    // MEDIUM_PER_GAUSSIAN, the same in sRGB, or where the water acts on pixels MEDIUM_DECODED,
+    // MEDIUM_PER_GAUSSIAN or MEDIUM_PER_GAUSSIAN_SRGB; when the water acts on pixels, MEDIUM_DECODED,
     // MEDIUM_AS_SHOWN or MEDIUM_OVER_BLACK.
     compose: u32,
-    // 1: what is formed is encoded for the loss; 0 where it is in sRGB already, or the loss in linear light.
+    // 1: the formed image is encoded for the loss. 0: it is in sRGB already, or the loss is in linear light.
     encode: u32,
-    // Rows of partials that are summed; those of pixels come first, then those of Gaussians.
+    // Rows of partials to sum: first those of pixels, then those of Gaussians.
     rows: u32,
     gaussian_rows: u32,
-    // 1: pixels of the truth with alpha below 255 are ignored.
+    // 1: pixels of the photograph with alpha below 255 are ignored.
     masked: u32,
-    // Scene units by which the unconstrained numbers of eq. 8 are multiplied: the usual viewing distance.
+    // Scene scale, scene units: the unit of the unconstrained parameters of eq. 8.
     unit: f32,
-    // Adam: rate, and 1/(1-b1^t), 1/(1-b2^t); weight of the squares of the nine (eq. 16), coefficients in
-    // 1/unit.
+    // Adam: rate, 1/(1-b1^t), 1/(1-b2^t). decay is the weight of the squared water parameters (eq. 16),
+    // coefficients in 1/unit.
     rate: f32,
     unbias1: f32,
     unbias2: f32,
     decay: f32,
-    // Eq. 15: weight by pixel of the alpha of pixels whose photograph is open water, and the distance in sRGB
-    // up to which it is.
+    // Eq. 15: weight per pixel of alpha where the photograph shows open water, and the largest distance in
+    // sRGB from its colour that counts as open water.
     background_weight: f32,
     background_distance: f32,
-    // Weight by pixel of what alpha lacks to 1 in all other pixels.
+    // Weight per pixel of 1 - alpha in all other pixels.
     surface_weight: f32,
-    // 1: water_step sums the gradients for WaterParamPredict in place of a step.
+    // 1: water_step accumulates the gradients for WaterParamPredict and takes no step.
     gathers: u32,
-    // Columns and rows of the map of what the view's rays end on; 0 where the view has none and colours tell.
+    // Columns and rows of the view's ray map; 0 if the view has none, and colours decide instead.
     map_columns: u32,
     map_rows: u32,
-    // Weight by pixel of the alpha of pixels that the map has as open water.
+    // Weight per pixel of the alpha of pixels that the map marks as open water.
     open_weight: f32,
-    // Weight by pixel of how far the logarithm of the range is from that of the sparse points of the cell,
-    // beyond range_slack.
+    // Weight per pixel of the difference between the log range and that of the cell's sparse points, beyond
+    // range_slack.
     range_weight: f32,
     range_slack: f32,
-    // Distance in sRGB from the colour of open water beyond which a pixel in a cell of MAP_EDGE is a surface.
+    // Distance in sRGB from the colour of open water beyond which a pixel in a MAP_EDGE cell is a surface.
     edge_distance: f32,
 }
 
-// What a cell of the map is: in the two lowest bits of its range (f32, scene units; 0 where no sparse point
-// lies in it).
+// Kind of a map cell, in the two lowest bits of its range (f32, scene units; 0 if the cell has no sparse
+// point).
 const MAP_UNKNOWN: u32 = 0u;
 const MAP_SURFACE: u32 = 1u;
 const MAP_OPEN: u32 = 2u;
@@ -51,10 +51,10 @@ const MAP_EDGE: u32 = 3u;
 
 // Pixels that a workgroup of water_backward sums.
 const WATER_CHUNK: u32 = 1024u;
-// Pixels with less alpha are open water where the water acts on pixels.
+// When the water acts on pixels, a pixel with less alpha is open water.
 const LEAST_ALPHA: f32 = 1e-3;
 
-// J of a pixel times its alpha in linear light, from what was blended, where the water acts on pixels.
+// J times alpha of a pixel, linear light, from the blended colour, when the water acts on pixels.
 fn own_light(compose: u32, seen: vec4<f32>) -> vec3<f32> {
     if compose == MEDIUM_OVER_BLACK {
         return decoded(seen.rgb);
@@ -62,13 +62,14 @@ fn own_light(compose: u32, seen: vec4<f32>) -> vec3<f32> {
     return select(seen.rgb, seen.a * decoded(seen.rgb / seen.a), compose == MEDIUM_AS_SHOWN);
 }
 
-// How much of a pixel of this alpha has the water behind it that ends no ray, its own alpha included.
+// Share of a pixel that receives backscatter: all of it, or only its alpha if rays that hit nothing are
+// black.
 fn watery_share(compose: u32, alpha: f32) -> f32 {
     return select(1.0, alpha, compose == MEDIUM_OVER_BLACK);
 }
 
-// A pixel in the light of which the water makes it: `seen` is what was blended and its alpha, `range` the
-// blended range.
+// A pixel as the water forms it, in the light in which the water is composed. `seen` is the blended colour
+// with its alpha, `range` the blended range.
 fn formed(compose: u32, water: Water, seen: vec4<f32>, range: f32) -> vec3<f32> {
     if compose == MEDIUM_PER_GAUSSIAN_SRGB {
         return seen.rgb + (1.0 - seen.a) * encoded(water.b_inf);

@@ -1,23 +1,23 @@
-// Adam's moments in 16 bits: 64 bytes for the transform and half of what the coefficients take. Needs
+// Adam's moments in 16 bits: 64 bytes for the transform, and half the size of the coefficients. Needs
 // adam.wgsl.
 //
-//   moments     [N*4]  vec4<u32>: 11 pairs in the order of the transform (first moment below, root of the
-//                      second above),
-//                      then as f32: second moments of red, green and blue, and the scale of sh_moment1
+//   moments     [N*4]  vec4<u32>: 11 pairs in the order of the transform (first moment in the low half,
+//                      root of the second in the high half), then as f32: second moments of red, green and
+//                      blue, and the scale of sh_moment1
 //   sh_moment1  [N*S]  vec2<u32>: four snorm16, laid out as sh_coeffs, in units of the scale
 //
-// Numbers of the transform are kept as logarithms: their sizes differ by many powers of ten between
-// parameters, scenes and Gaussians, and what counts is the relative error: 0.14 % and 0.07 % at most.
+// Moments of the transform are stored as logarithms, because their sizes differ by many powers of ten between
+// parameters, scenes and Gaussians. What matters is the relative error: at most 0.14 % and 0.07 %.
 //
-// The gradient of coefficient k of a channel is basis_k(direction) times that of the channel, and the squares
-// of the 2l + 1 functions of any band add up to (2l + 1) / 4 pi in every direction. So the mean square over a
-// band is the same for all bands: one second moment a channel, E[v_c^2] / 4 pi, serves them all, and for the
-// constant colour it is Adam's own.
+// The gradient of coefficient k of a channel is basis_k(direction) times that of the channel. The squares of
+// the 2l + 1 functions of a band add up to (2l + 1) / 4 pi in every direction. So the mean square over a band
+// is the same for all bands. One second moment per channel, E[v_c^2] / 4 pi, serves them all; for the
+// constant colour it is exactly Adam's own.
 
 @group(0) @binding(10) var<storage, read_write> moments: array<vec4<u32>>;
 @group(0) @binding(11) var<storage, read_write> sh_moment1: array<vec2<u32>>;
 
-// Powers of two from 2^-64 to 2^64.
+// The levels cover 2^-64 to 2^64.
 const LOWEST: f32 = -64.0;
 const LEVELS_FIRST: f32 = 256.0;
 const LEVELS_ROOT: f32 = 512.0;
@@ -34,7 +34,7 @@ fn decode_root(words: vec4<u32>) -> vec4<f32> {
     return select(exp2(vec4<f32>(level) * (1.0 / LEVELS_ROOT) + LOWEST), vec4<f32>(0.0), level == vec4<u32>(0u));
 }
 
-// Level 0 is zero, and what is smaller than the lowest power.
+// Level 0 stands for zero and for everything below the lowest power.
 fn encode(first: vec4<f32>, root: vec4<f32>) -> vec4<u32> {
     let tiny = vec4<f32>(5.4210109e-20);
     let m = clamp(round((log2(max(abs(first), tiny)) - LOWEST) * LEVELS_FIRST), vec4<f32>(0.0), vec4<f32>(32767.0));
@@ -49,14 +49,14 @@ fn keeps_gradients() -> bool {
 fn keep_gradients(i: u32, d0: vec4<f32>, d1: vec4<f32>, d2: vec4<f32>) {}
 fn keep_colour_gradient(n: u32, gradient: vec4<f32>) {}
 
-// Of the Gaussian at hand: second moments of the channels, what a first moment is multiplied with, scales of
-// sh_moment1.
+// State of the current Gaussian: second moments of the channels, the factor on first moments, and the scales
+// of sh_moment1.
 var<private> second: vec3<f32>;
 var<private> per_channel: vec3<f32>;
 var<private> scale_before: f32;
 var<private> scale_after: f32;
 
-// `most` is the largest of the basis functions: no first moment will be larger than the scale.
+// `most` is the largest basis function, so that no first moment exceeds the scale.
 fn begin_colour(i: u32, v_rgb: vec3<f32>, most: f32, pace: Pace) {
     let row2 = moments[4u * i + 2u];
     let row3 = moments[4u * i + 3u];

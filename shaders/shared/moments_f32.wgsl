@@ -1,5 +1,5 @@
-// Adam's moments in f32, one pair a parameter: 96 bytes for the transform and 32 a coefficient's group of
-// vec4. Needs adam.wgsl.
+// Adam's moments in f32, one pair per parameter: 96 bytes for the transform, and 32 bytes per vec4 of
+// coefficients. Needs adam.wgsl.
 //
 //   moments     [N*6]  vec4: first, then second moments of the transform
 //   sh_moment1, sh_moment2 [N*S]  vec4, laid out as sh_coeffs
@@ -8,7 +8,7 @@
 @group(0) @binding(11) var<storage, read_write> sh_moment1: array<vec4<f32>>;
 @group(0) @binding(12) var<storage, read_write> sh_moment2: array<vec4<f32>>;
 
-// Whether raw gradients are stored in place of first moments and no step is taken (tests).
+// Whether raw gradients are stored instead of first moments, and no step is taken (tests).
 fn keeps_gradients() -> bool {
     return veiled(step.gradients_only, arrayLength(&moments)) != 0u;
 }
@@ -23,11 +23,11 @@ fn keep_colour_gradient(n: u32, gradient: vec4<f32>) {
     sh_moment1[n] = gradient;
 }
 
-// Before and after the coefficients of a Gaussian: nothing to do here.
+// Called before and after the coefficients of a Gaussian; nothing to do here.
 fn begin_colour(i: u32, v_rgb: vec3<f32>, most: f32, pace: Pace) {}
 fn end_colour(i: u32) {}
 
-// What is subtracted from vec4 n of the coefficients; `part` of 0, 1, 2 says which channels lie in it.
+// The step to subtract from vec4 n of the coefficients; `part` (0, 1, 2) says which channels it holds.
 fn colour_step(n: u32, part: u32, gradient: vec4<f32>, rate: vec4<f32>, pace: Pace) -> vec4<f32> {
     let m = moved(BETA1, old(sh_moment1[n], pace), gradient);
     let v = moved(BETA2, old(sh_moment2[n], pace), gradient * gradient);
@@ -36,7 +36,7 @@ fn colour_step(n: u32, part: u32, gradient: vec4<f32>, rate: vec4<f32>, pace: Pa
     return rate * (m * pace.unbias.x) / (sqrt(v * pace.unbias.y) + EPSILON);
 }
 
-// What is subtracted from vec4 `part` of the transform.
+// The step to subtract from vec4 `part` of the transform.
 fn transform_step(i: u32, part: u32, gradient: vec4<f32>, rate: vec4<f32>, pace: Pace) -> vec4<f32> {
     let n = 6u * i + part;
     let m = moved(BETA1, old(moments[n], pace), gradient);

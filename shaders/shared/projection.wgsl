@@ -42,11 +42,11 @@ fn project(frame: Frame, mean: vec3<f32>, rot: mat3x3<f32>, scales: vec3<f32>) -
     return p;
 }
 
-// The 2D filter of Mip-Splatting (Yu et al. 2024, eq. 9): what an opacity is multiplied with so that the
-// low-pass spreads a splat without adding to it, sqrt(det(cov2d without low-pass) / det(cov2d)). The first
-// determinant, of A A^T, is the square of |a_x x a_y|: without the difference of large numbers in which
-// needles would be lost. The paper's variance is 0.1 px^2; here it is BLUR, as in the antialiased modes of
-// gsplat and of viewers, so that they show what was trained.
+// The 2D filter of Mip-Splatting (Yu et al. 2024, eq. 9): the factor on opacity that keeps the low-pass from
+// adding to a splat, sqrt(det(cov2d without low-pass) / det(cov2d)). The first determinant, of A A^T, is the
+// square of |a_x x a_y|. This form avoids the difference of large numbers that would lose needles. The
+// paper's variance is 0.1 px^2. Here it is BLUR, as in the antialiased modes of gsplat and of viewers, so
+// that they show what was trained.
 fn compensation(p: Projection, det: f32) -> f32 {
     return length(cross(p.a_x, p.a_y)) / sqrt(det);
 }

@@ -20,7 +20,7 @@ fn random_bits(seed: u32, stream: u32, a: u32, b: u32) -> vec3<u32> {
     return pcg3d(pcg3d(v));
 }
 
-// Uniform in (0, 1]: never 0, so that a logarithm may follow.
+// Uniform in (0, 1]: never 0, so that its logarithm is finite.
 fn uniform_open(bits: u32) -> f32 {
     return (f32(bits >> 8u) + 1.0) * (1.0 / 16777216.0);
 }

@@ -1,9 +1,9 @@
-// Eight neighbouring windows of a row or a column at once, each `radius` pixels on either side of its centre:
-// every entry is loaded once for all of them. Needs priors.
+// Eight neighbouring windows of a row or a column at once, each with `radius` pixels on either side of its
+// centre. Every entry is loaded once for all windows. Needs priors.
 //
-// Entry k of a thread's run lies k - radius pixels from the first centre; `entries` says how many there are.
+// Entry k of a thread's run lies k - radius pixels from the first centre; `entries` gives their number.
 
-// Windows of a thread.
+// Windows per thread.
 const WINDOWS: u32 = 8u;
 const FIRST: vec4<u32> = vec4<u32>(0u, 1u, 2u, 3u);
 const SECOND: vec4<u32> = vec4<u32>(4u, 5u, 6u, 7u);
@@ -12,7 +12,7 @@ fn entries(radius: u32) -> u32 {
     return 2u * radius + WINDOWS;
 }
 
-// Smallest entry of a window and where it lies.
+// Smallest entry of each window, and its position.
 struct Least {
     first: vec4<f32>,
     second: vec4<f32>,
@@ -24,7 +24,7 @@ fn no_least() -> Least {
     return Least(vec4<f32>(NO_SIGNAL), vec4<f32>(NO_SIGNAL), vec4<u32>(NOWHERE), vec4<u32>(NOWHERE));
 }
 
-// With entry k, whose place is `at`. Of equal ones the first stays.
+// `before` updated with entry k at position `at`. Of equal entries, the first stays.
 fn with_entry(before: Least, radius: u32, k: u32, value: f32, at: u32) -> Least {
     var least = before;
     let last = vec4<u32>(2u * radius);

@@ -1,4 +1,4 @@
-// A projected splat, or a gradient by one, as three vectors.
+// A projected splat, or the gradient w.r.t. one, as three vectors.
 //
 //   splat     (mean2d xy, conic a, b), (conic c, opacity, range, E), (rgb, 0)
 //   gradient  (v_mean2d xy, v_conic a, b), (v_conic c, v_opacity, v_range, sum |v_mean2d|), (v_rgb, sum of

@@ -1,6 +1,6 @@
-// Ranks inside a subgroup of any size from 8 to 128 lanes, for the stages that are written with subgroups.
+// Ranks inside a subgroup of 8 to 128 lanes, for the stages written with subgroups.
 
-// The lanes before one, as a mask.
+// Mask of the lanes before `lane`.
 fn lanes_before(lane: u32) -> vec4<u32> {
     let words = vec4<u32>(0u, 32u, 64u, 96u);
     let inside = clamp(vec4<u32>(lane), words, words + vec4<u32>(31u)) - words;
@@ -13,7 +13,7 @@ fn ones(mask: vec4<u32>) -> u32 {
     return n.x + n.y + n.z + n.w;
 }
 
-// The first lane of a mask that is not empty.
+// The first lane of a non-empty mask.
 fn first_lane(mask: vec4<u32>) -> u32 {
     if mask.x != 0u { return firstTrailingBit(mask.x); }
     if mask.y != 0u { return 32u + firstTrailingBit(mask.y); }
@@ -21,8 +21,7 @@ fn first_lane(mask: vec4<u32>) -> u32 {
     return 96u + firstTrailingBit(mask.w);
 }
 
-// The lanes that hold a key with the digit of this one; none where `valid` does not hold. All lanes must be
-// here.
+// The lanes whose key has the digit of this lane; empty if `valid` is false. All lanes must reach this call.
 fn same_digit(digit: u32, valid: bool) -> vec4<u32> {
     var mask = subgroupBallot(valid);
     for (var bit = 0u; bit < 6u; bit++) {

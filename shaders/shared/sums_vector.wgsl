@@ -1,9 +1,9 @@
-// How the threads of a tile add up gradients when they are the eight lanes of one vector. Goes with
+// How the threads of a tile add up gradients when they are the eight lanes of one vector. Used with
 // exchange_vector.wgsl.
 
 var<private> mine_sums: Splat;
 
-// The sum over the lanes, in their order.
+// The sum over the lanes, in lane order.
 fn over_lanes(v: vec4<f32>) -> vec4<f32> {
     return (((((((subgroupBroadcast(v, 0u) + subgroupBroadcast(v, 1u)) + subgroupBroadcast(v, 2u)) + subgroupBroadcast(v, 3u))
         + subgroupBroadcast(v, 4u)) + subgroupBroadcast(v, 5u)) + subgroupBroadcast(v, 6u)) + subgroupBroadcast(v, 7u));

@@ -1,8 +1,8 @@
-// How the threads of a tile add up gradients: through workgroup memory. Goes with exchange_workgroup.wgsl.
+// How the threads of a tile add up gradients: through workgroup memory. Used with exchange_workgroup.wgsl.
 
 var<workgroup> sh_partial: array<vec4<f32>, 24 * LANES>;
 
-// A thread's part of the gradient of splat i of the batch.
+// Stores a thread's part of the gradient of splat i of the batch.
 fn give_sums(lane: u32, i: u32, sums: Splat) {
     let at = 3u * LANES * i + lane;
     sh_partial[at] = sums.a;
@@ -10,7 +10,7 @@ fn give_sums(lane: u32, i: u32, sums: Splat) {
     sh_partial[at + 2u * LANES] = sums.c;
 }
 
-// Adds the parts of the batch in the order of the threads and writes them to the slots.
+// Adds the parts of the batch in thread order and writes the sums to the slots.
 fn write_sums(lane: u32, first: u32, last: u32) {
     workgroupBarrier();
     for (var i = lane; i < 3u * BATCH && first + i / 3u < last; i += LANES) {

@@ -1,4 +1,5 @@
-// Which tiles a splat touches: its box, then the exact test of ellipse against tile. Needs frame.wgsl.
+// Which tiles a splat touches: first its bounding box, then the exact test of ellipse against tile. Needs
+// frame.wgsl.
 
 struct Splat2d {
     mean: vec2<f32>,
@@ -7,16 +8,16 @@ struct Splat2d {
     extent: f32,
 }
 
-// Tiles [x0, y0, x1, y1) of the box in which sigma <= extent, as far as they lie around the band; empty for
-// extent < 0.
+// Tiles [x0, y0, x1, y1) of the bounding box of sigma <= extent, clamped to the rectangle of the band. Empty
+// for extent < 0.
 fn tile_box(frame: Frame, s: Splat2d) -> vec4<u32> {
     if !(s.extent >= 0.0) {
         return vec4<u32>(0u);
     }
-    // The covariance back from the conic: xx = c / det, yy = a / det.
+    // The covariance from the conic: xx = c / det, yy = a / det.
     let det = s.conic.x * s.conic.z - s.conic.y * s.conic.y;
     let half_size = sqrt(2.0 * s.extent * vec2<f32>(s.conic.z, s.conic.x) / det);
-    // Pixel i has its centre at i + 0.5. The slack of 1e-3 pixels keeps rounding from cutting a tile off.
+    // Pixel i has its centre at i + 0.5. A slack of 1e-3 pixels keeps rounding from dropping a tile.
     let lo = floor((s.mean - half_size - 0.501) / f32(TILE));
     let hi = floor((s.mean + half_size - 0.499) / f32(TILE)) + 1.0;
     let least = floor(frame.rect_min / f32(TILE));
@@ -36,7 +37,8 @@ fn sigma_at(s: Splat2d, d: vec2<f32>) -> f32 {
 
 // Whether sigma <= extent anywhere on the rectangle of the tile's pixel centres.
 //
-// sigma is convex: its minimum is at the centre if that lies inside, else on an edge that faces the centre.
+// sigma is convex: its minimum is at the splat's centre if that lies inside, else on an edge facing the
+// centre.
 fn touches(s: Splat2d, tile: vec2<u32>) -> bool {
     let lo = vec2<f32>(tile * TILE) + 0.5 - s.mean;
     let hi = lo + f32(TILE - 1u);
@@ -53,6 +55,6 @@ fn touches(s: Splat2d, tile: vec2<u32>) -> bool {
         let x = clamp(-s.conic.y / s.conic.x * near.y, lo.x, hi.x);
         least = min(least, sigma_at(s, vec2<f32>(x, near.y)));
     }
-    // A part in 1e4 of slack: the rasteriser applies the cutoff itself.
+    // A relative slack of 1e-4: the rasteriser applies the cutoff itself.
     return least <= s.extent * 1.0001 + 1e-4;
 }

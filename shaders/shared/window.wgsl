@@ -1,8 +1,9 @@
 // Eight neighbouring outputs of the SSIM window at once. Needs ssim.wgsl and a function
-// `input(k) -> vec4<f32>` of the stage, which gives the k-th of the 18 inputs, zeros outside the picture.
+// `input(k) -> vec4<f32>` of the stage. That function gives the k-th of the 18 inputs, or zeros outside the
+// image.
 //
-// Each input is fetched once, not eleven times; the calls are written out, because a CPU adapter pays for a
-// loop with a masked store of every running sum.
+// Each input is fetched once, not eleven times. The calls are unrolled, because in a loop a CPU adapter pays
+// for a masked store of every running sum.
 
 var<private> sums: array<vec4<f32>, 8>;
 

@@ -1,10 +1,12 @@
 //! Gaussians on the device, in blocks.
 //!
-//! A block holds at most [`BLOCK_CAPACITY`] Gaussians, so that no array of it exceeds the smallest storage
-//! binding (128 MiB: coefficients of SH 3 take 96); a model is up to [`MAX_BLOCKS`] blocks. What remains in
-//! one binding is the flag of every Gaussian (`Frame`), 4 bytes: 33 million Gaussians where bindings end at
-//! 128 MiB, a typed error beyond. Trainable blocks come first, then frozen ones. Blocks are filled in order:
-//! all but the last trainable one are full.
+//! A block holds at most [`BLOCK_CAPACITY`] Gaussians, so that none of its arrays exceeds the smallest
+//! storage binding of 128 MiB (the coefficients of SH degree 3 take 96). A model has up to [`MAX_BLOCKS`]
+//! blocks.
+//! Only the flags of all Gaussians (`Frame`) share one binding, 4 bytes each. Bindings of 128 MiB allow 33
+//! million Gaussians; beyond that there is a typed error.
+//! Trainable blocks come first, then frozen ones. Blocks are filled in order: all but the last trainable one
+//! are full.
 
 use std::sync::OnceLock;
 
@@ -18,38 +20,36 @@ use crate::{CoreError, Result};
 
 pub use crate::memory::BLOCK_CAPACITY;
 
-/// vec4 that the coefficients of one Gaussian take: three for each four of the K coefficients.
+/// Number of vec4 for the coefficients of one Gaussian: three for every four of the K coefficients.
 pub fn sh_stride(sh_degree: u8) -> u32 {
     3 * (u32::from(sh_degree) + 1).pow(2).div_ceil(4)
 }
 
 /// State of Adam and of density control.
 ///
-/// What the moments of a Gaussian hold says nothing while it has taken no step; see
-/// `shaders/shared/adam.wgsl`.
+/// The moments of a Gaussian are undefined until it has taken a step; see `shaders/shared/adam.wgsl`.
 pub struct BlockTraining {
     /// `[N*4]` or, in f32, `[N*6]` vec4: moments of the transforms; see `shaders/shared/moments_*.wgsl`.
     pub moments: wgpu::Buffer,
-    /// First moments of the coefficients: half of what those take, or as much in f32.
+    /// First moments of the coefficients: half the size of the coefficients, or the same size in f32.
     pub sh_moment1: wgpu::Buffer,
     /// Second moments of the coefficients, in f32 only.
     pub sh_moment2: Option<wgpu::Buffer>,
-    /// `[N]` vec4 of density control and, in z, of smoothing; see `project_backward.wgsl` and
+    /// `[N]` vec4: sums of density control and, in z, the smoothing; see `project_backward.wgsl` and
     /// `smoothing.wgsl`.
     pub density_sums: wgpu::Buffer,
-    /// Sums of the bands of a picture that is rendered in several: `[N*3]` vec4, made when it is first
-    /// needed.
+    /// `[N*3]` vec4: sums over the bands of a view that is rendered in several, allocated on first use.
     band_gradients: OnceLock<wgpu::Buffer>,
 }
 
 impl BlockTraining {
-    /// How the moments are kept.
+    /// How the moments are stored.
     pub fn kind(&self) -> Moments {
         if self.sh_moment2.is_some() { Moments::F32 } else { Moments::Compact }
     }
 
-    /// Its arrays whose content outlives an iteration, with the bytes that a Gaussian takes in each; `stride`
-    /// as [`sh_stride`] gives it.
+    /// Its arrays whose content outlives an iteration, each with its bytes per Gaussian; `stride` as given by
+    /// [`sh_stride`].
     pub fn arrays(&self, stride: u32) -> Vec<(&wgpu::Buffer, usize)> {
         let colour = 16 * stride as usize;
         match &self.sh_moment2 {
@@ -65,7 +65,7 @@ impl BlockTraining {
         }
     }
 
-    /// The sums of bands; made at the first call.
+    /// The sums of bands; allocated at the first call.
     ///
     /// # Errors
     /// When the device cannot hold them.
@@ -90,23 +90,23 @@ pub struct Block {
     pub transforms: wgpu::Buffer,
     /// `[capacity*stride]` vec4.
     pub sh_coeffs: wgpu::Buffer,
-    /// `[chunks]`: whether the view may see each chunk of [`CULL_CHUNK`] Gaussians; always so in trainable
+    /// `[chunks]`: whether the view may see each chunk of [`CULL_CHUNK`] Gaussians; always true in trainable
     /// blocks.
     pub chunk_seen: wgpu::Buffer,
-    /// Boxes around the chunks of a frozen block; see `cull_chunks.wgsl`.
+    /// Bounding boxes of the chunks of a frozen block; see `cull_chunks.wgsl`.
     pub bounds: Option<wgpu::Buffer>,
     /// Present in trainable blocks.
     pub training: Option<BlockTraining>,
 }
 
 impl Block {
-    /// Chunks that its Gaussians take.
+    /// Number of chunks of its Gaussians.
     pub fn chunks(&self) -> u32 {
         self.count.div_ceil(CULL_CHUNK)
     }
 
-    /// Its arrays whose content outlives an iteration, with the bytes that a Gaussian takes in each; `stride`
-    /// as [`sh_stride`] gives it.
+    /// Its arrays whose content outlives an iteration, each with its bytes per Gaussian; `stride` as given by
+    /// [`sh_stride`].
     pub fn arrays(&self, stride: u32) -> Vec<(&wgpu::Buffer, usize)> {
         let mut arrays = vec![(&self.transforms, 48), (&self.sh_coeffs, 16 * stride as usize)];
         if let Some(training) = &self.training {
@@ -123,11 +123,11 @@ pub struct Blocks {
     bases: wgpu::Buffer,
 }
 
-/// Most blocks of a model: 128 million Gaussians.
+/// Largest number of blocks of a model: 128 million Gaussians.
 const MAX_BLOCKS: usize = 256;
 
-/// Coefficients of a Gaussian as devices have them at a degree: rows of four numbers, RGB one after the
-/// other.
+/// Coefficients of a Gaussian in device layout for a degree: RGB after RGB, padded to whole groups of four
+/// coefficients.
 fn coefficients(model: &Gaussians, i: usize, sh_degree: u8) -> Vec<f32> {
     let coeffs = model.coeffs();
     let used = coeffs.min((usize::from(sh_degree) + 1).pow(2));
@@ -171,7 +171,7 @@ impl Blocks {
         self.trainable().map(|(_, block, _)| block.count).sum()
     }
 
-    /// First index of each block among all; `base of block b` for shaders.
+    /// First index of each block among all Gaussians, for shaders.
     pub fn bases(&self) -> &wgpu::Buffer {
         &self.bases
     }
@@ -197,8 +197,8 @@ impl Blocks {
             .sum()
     }
 
-    /// Appends frozen Gaussians in the given order, with culling bounds: [`super::spatial_order`] makes them
-    /// tight.
+    /// Appends frozen Gaussians in the given order, with culling bounds. [`super::spatial_order`] makes the
+    /// bounds tight.
     ///
     /// # Errors
     /// When the device cannot hold them.
@@ -212,14 +212,14 @@ impl Blocks {
             self.blocks.push(block);
             let at = self.blocks.len() - 1;
             self.fill(gpu, at, model, rows.iter().map(|&row| row as usize));
-            // What was written waits on the host until it is submitted.
+            // Writes are staged on the host until they are submitted.
             self.flush(gpu);
         }
         self.write_uniforms(gpu);
         Ok(())
     }
 
-    /// Appends trainable Gaussians with room for `cap` in all; no frozen ones may be there yet.
+    /// Appends trainable Gaussians with room for `cap` in all. There must be no frozen Gaussians yet.
     ///
     /// # Errors
     /// When the device cannot hold them.
@@ -299,7 +299,7 @@ impl Blocks {
         block.count = count as u32;
     }
 
-    /// Rows of a model as `densify_place.wgsl` takes them: transforms, then coefficients.
+    /// Rows of a model in the layout of `densify_place.wgsl`: transforms, then coefficients.
     pub fn staged_rows(&self, model: &Gaussians, rows: &[u32]) -> Vec<f32> {
         let row = |i: &u32| {
             let transform = model.transform(*i as usize).into_iter().flatten();
@@ -308,7 +308,7 @@ impl Blocks {
         rows.iter().flat_map(row).collect()
     }
 
-    /// Reads where the trainable Gaussians are and how large.
+    /// Reads the transforms of the trainable Gaussians.
     ///
     /// # Errors
     /// When the device fails.
@@ -320,7 +320,7 @@ impl Blocks {
         Ok(all)
     }
 
-    /// Sets the number of Gaussians in trainable blocks; entries that are new must be written by a kernel.
+    /// Sets the number of Gaussians in trainable blocks. A kernel must write the new entries.
     pub fn set_trainable_total(&mut self, gpu: &Gpu, total: u32) {
         let mut left = total;
         for block in self.blocks.iter_mut().filter(|block| block.training.is_some()) {
@@ -347,12 +347,12 @@ impl Blocks {
         gpu.write(&self.bases, 0, &bases);
     }
 
-    /// Submits what was written so far, so that writes and later recordings keep their order.
+    /// Submits the writes so far, so that writes and later recordings keep their order.
     pub fn flush(&self, gpu: &Gpu) {
         Recorder::new(gpu).submit();
     }
 
-    /// Reads the trainable Gaussians, or all where none is trainable.
+    /// Reads the trainable Gaussians, or all Gaussians if none is trainable.
     ///
     /// # Errors
     /// When the device fails.
@@ -380,11 +380,11 @@ impl Blocks {
         Ok(model)
     }
 
-    /// The same Gaussians, in the same transforms on the device, with coefficients of degree 0 of their own,
-    /// which are 0: for pictures of something else than the model's colours.
+    /// The same Gaussians, sharing their transforms on the device, with coefficients of degree 0 of their
+    /// own, all 0. For images of quantities other than the model's colours.
     ///
     /// # Errors
-    /// When the device cannot hold them: 48 bytes a Gaussian.
+    /// When the device cannot hold the coefficients: 48 bytes per Gaussian.
     pub fn sharing_transforms(&self, gpu: &Gpu) -> Result<Self> {
         let mut shared = Self::new(gpu, 0)?;
         for block in &self.blocks {

@@ -1,21 +1,21 @@
-//! Culling bounds of Gaussians that do not change: an order in space, and a box around every chunk of it.
+//! Culling bounds of frozen Gaussians: a spatial order, and a bounding box for every chunk of it.
 //!
-//! A view that sees a fiftieth of a merged model must not look at every Gaussian. Trained Gaussians have no
-//! bounds: they move at every step, and density control puts new ones anywhere.
+//! A view that sees a fiftieth of a merged model must not visit every Gaussian. Trainable Gaussians have no
+//! bounds: they move at every step, and density control places new ones anywhere.
 
 use rayon::prelude::*;
 
 use crate::gaussians::Gaussians;
 
-/// Gaussians under one bound. Mirror: `CHUNK` of `shaders/shared/gaussian.wgsl`.
+/// Gaussians per culling bound. Mirror: `CHUNK` of `shaders/shared/gaussian.wgsl`.
 pub const CULL_CHUNK: u32 = 4096;
 
-/// Gaussians that reach further than this many times the median have chunks of their own: one of them would
+/// Gaussians that reach farther than this many times the median get chunks of their own. One of them would
 /// make the bound of its chunk useless.
 const WIDE: f32 = 16.0;
 
-/// How far a Gaussian reaches from its centre, scene units: where its weight falls below one step of 8-bit
-/// colour. 0 for one that is never seen.
+/// Distance from its centre, scene units, at which the weight of a Gaussian falls below one step of 8-bit
+/// colour. 0 for a Gaussian that is never visible.
 fn reach(model: &Gaussians, index: usize) -> f32 {
     let opacity = 1.0 / (1.0 + (-model.opacity_logits[index]).exp());
     let deviations = (2.0 * (255.0 * opacity).ln().max(0.0)).sqrt();
@@ -24,7 +24,7 @@ fn reach(model: &Gaussians, index: usize) -> f32 {
     if reach.is_finite() && model.means[index].iter().all(|v| v.is_finite()) { reach } else { 0.0 }
 }
 
-/// The Gaussians of a model along a Morton curve, the few that reach far behind the others.
+/// The Gaussians of a model along a Morton curve; the few that reach far come last.
 pub fn spatial_order(model: &Gaussians) -> Vec<u32> {
     let n = model.len();
     if n <= CULL_CHUNK as usize {
@@ -61,7 +61,7 @@ pub fn spatial_order(model: &Gaussians) -> Vec<u32> {
     keys.into_iter().map(|(_, _, index)| index).collect()
 }
 
-/// The 21 bits of a number, two zeros between each.
+/// The low 21 bits of a number, with two zeros between neighbours.
 fn spread(value: u64) -> u64 {
     let mut v = value & 0x1f_ffff;
     v = (v | v << 32) & 0x001f_0000_0000_ffff;
@@ -71,8 +71,8 @@ fn spread(value: u64) -> u64 {
     (v | v << 2) & 0x1249_2492_4924_9249
 }
 
-/// `[chunks*2]`: (centre of the box around the means, greatest reach; half its sides, 0). A chunk that is
-/// never seen has a reach below 0.
+/// `[chunks*2]`: (centre of the bounding box of the means, largest reach), (half its sides, 0). A chunk that
+/// is never visible has a reach below 0.
 pub fn chunk_bounds(model: &Gaussians, order: &[u32]) -> Vec<[f32; 4]> {
     let bound = |chunk: &[u32]| {
         let (mut low, mut high, mut furthest) = ([f32::MAX; 3], [f32::MIN; 3], -1.0_f32);
@@ -91,7 +91,7 @@ pub fn chunk_bounds(model: &Gaussians, order: &[u32]) -> Vec<[f32; 4]> {
             return [[0.0, 0.0, 0.0, -1.0], [0.0; 4]];
         }
         let middle: [f32; 3] = std::array::from_fn(|k| 0.5 * low[k] + 0.5 * high[k]);
-        // To the further end, so that rounding of the middle leaves none outside.
+        // To the farther end, so that rounding of the middle leaves no mean outside.
         let half = |k: usize| (high[k] - middle[k]).max(middle[k] - low[k]);
         [[middle[0], middle[1], middle[2], furthest], [half(0), half(1), half(2), 0.0]]
     };
@@ -118,7 +118,7 @@ mod tests {
     }
 
     #[test]
-    fn the_order_takes_every_gaussian_once_and_keeps_neighbours_together() {
+    fn spatial_order_is_a_permutation_with_neighbours_together() {
         let mut model = random(7, 8 * CULL_CHUNK);
         model.log_scales[77] = [4.0; 3];
         model.means[99] = [f32::NAN; 3];
@@ -126,8 +126,8 @@ mod tests {
         let mut sorted = order.clone();
         sorted.sort_unstable();
         assert!(sorted.iter().copied().eq(0..8 * CULL_CHUNK));
-        assert_eq!(order.last(), Some(&77), "the one that reaches far is last");
-        // A box of side 2 cut in eight chunks, about one an octant: half sides of 1/2.
+        assert_eq!(order.last(), Some(&77), "the Gaussian that reaches far is last");
+        // A box of side 2 cut into eight chunks, about one per octant: half sides of 1/2.
         let bounds = chunk_bounds(&model, &order);
         assert_eq!(bounds.len(), 16);
         let volume = |half: &[f32; 4]| half[..3].iter().product::<f32>();
@@ -136,7 +136,7 @@ mod tests {
     }
 
     #[test]
-    fn a_bound_holds_every_mean_and_the_furthest_reach() {
+    fn a_bound_contains_every_mean_and_the_largest_reach() {
         let model = random(8, 9000);
         let order = spatial_order(&model);
         let bounds = chunk_bounds(&model, &order);

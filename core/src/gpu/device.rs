@@ -1,4 +1,4 @@
-//! Adapter, device, buffers and reading back.
+//! Adapter, device, buffers and reads from the device.
 
 use std::io::Write as _;
 use std::sync::Arc;
@@ -8,31 +8,31 @@ use super::kernel::{Kernels, TileLayout};
 use super::memory::Ledger;
 use crate::{CoreError, Result};
 
-/// Which adapter may be used, and how much of it.
+/// Which adapter to use, and how much of its memory.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct GpuOptions {
-    /// Index among the adapters that [`adapters`] lists; `None` takes the first real GPU.
+    /// Index in the list of [`adapters`]; `None` takes the first real GPU.
     pub index: Option<usize>,
-    /// Whether an adapter that runs on the CPU (lavapipe) may be used when there is no GPU.
+    /// Whether an adapter that runs on the CPU (lavapipe) may be used if there is no GPU.
     pub allow_cpu: bool,
-    /// Most memory that may be allocated at once, bytes, for who shares a GPU and for tests; beyond it
-    /// allocation fails as on a device that has no more. The driver's blocks, of which it is cut, may hold
-    /// some more ([`DeviceMemory::reserved_bytes`](super::DeviceMemory::reserved_bytes)). `None`, the
-    /// default, is as much as the driver gives.
+    /// Largest amount of memory allocated at once, bytes, for shared GPUs and for tests. Beyond it,
+    /// allocation fails as on a device of that size. The driver's blocks, which buffers are cut from, may be
+    /// somewhat larger in total ([`DeviceMemory::reserved_bytes`](super::DeviceMemory::reserved_bytes)).
+    /// `None`, the default, sets no limit beyond the driver's.
     pub memory_limit: Option<u64>,
-    /// Whether shaders check every index and every loop at run time. `None`, the default: as `debug_assert`
-    /// does, in debug builds only. All shaders are this crate's own, and `core/tests/kernels` proves them the
-    /// same with and without.
+    /// Whether shaders check every index and every loop at run time. `None`, the default: in debug builds
+    /// only, as `debug_assert` does. All shaders are this crate's own, and `core/tests/kernels` tests that
+    /// the results are the same with and without checks.
     pub shader_checks: Option<bool>,
 }
 
-/// Below this, nothing can be done at all: a number that was not meant as bytes.
+/// A smaller limit leaves no room for any work; it was probably not meant as bytes.
 const LEAST_MEMORY_LIMIT: u64 = 1 << 20;
 
-/// What an adapter is.
+/// Description of an adapter.
 #[derive(Clone, Debug, PartialEq)]
 pub struct AdapterSummary {
-    /// Name by its driver.
+    /// Name reported by its driver.
     pub name: String,
     /// Driver and version.
     pub driver: String,
@@ -42,8 +42,8 @@ pub struct AdapterSummary {
     pub is_cpu: bool,
     /// Largest storage binding, bytes.
     pub max_binding_bytes: u64,
-    /// Where it is on the bus, which tells equal GPUs of one machine apart; empty where the driver does not
-    /// say.
+    /// Address on the PCI bus, which distinguishes equal GPUs of one machine; empty if the driver does not
+    /// report it.
     pub pci_bus_id: String,
 }
 
@@ -60,7 +60,7 @@ impl AdapterSummary {
         }
     }
 
-    /// Whether both are certainly one GPU of this machine, which two backends may list each.
+    /// Whether both are certainly the same GPU of this machine, listed by two backends.
     pub fn is_same_gpu(&self, other: &Self) -> bool {
         let of_two_backends = self.backend != other.backend && self.name == other.name;
         match (self.pci_bus_id.as_str(), other.pci_bus_id.as_str()) {
@@ -70,7 +70,7 @@ impl AdapterSummary {
     }
 }
 
-/// Adapters with their numbers, in one line, for those who named one that is not there.
+/// Adapters with their numbers in one line, for the error about a number that does not exist.
 pub fn numbered(adapters: &[AdapterSummary]) -> String {
     let line = |(index, adapter): (usize, &AdapterSummary)| {
         let cpu = if adapter.is_cpu { ", on the CPU" } else { "" };
@@ -82,35 +82,34 @@ pub fn numbered(adapters: &[AdapterSummary]) -> String {
 fn instance() -> wgpu::Instance {
     let mut descriptor = wgpu::InstanceDescriptor::new_without_display_handle();
     descriptor.backends = wgpu::Backends::PRIMARY;
-    // Indirect dispatches are clamped by our own `count_*` kernels; wgpu's check would add a dispatch to
-    // each.
+    // Our own `count_*` kernels clamp indirect dispatches; wgpu's check would add a dispatch to each.
     descriptor.flags = wgpu::InstanceFlags::empty();
     wgpu::Instance::new(descriptor)
 }
 
 fn all_adapters(instance: &wgpu::Instance) -> Vec<wgpu::Adapter> {
     let mut adapters = pollster::block_on(instance.enumerate_adapters(wgpu::Backends::PRIMARY));
-    // Real GPUs first; the order within is the driver's.
+    // Real GPUs first; otherwise in the driver's order.
     adapters.sort_by_key(|adapter| adapter.get_info().device_type == wgpu::DeviceType::Cpu);
     adapters
 }
 
-/// All adapters of this machine, real GPUs first.
+/// Lists all adapters of this machine, real GPUs first.
 pub fn adapters() -> Vec<AdapterSummary> {
     all_adapters(&instance()).iter().map(AdapterSummary::of).collect()
 }
 
-/// The first device, also one on the CPU, for the test `what`; `None` where there is none, which stderr is
-/// told.
+/// The first device, including one on the CPU, for the test `what`. `None`, with a message on stderr, if
+/// there is none.
 ///
 /// # Panics
-/// When there is an adapter and it cannot be opened. With `FATHOM_TEST_REQUIRE_GPU=1` there must be one: a CI
-/// that has a driver must not pass without it.
+/// When there is an adapter but it cannot be opened, or when `FATHOM_TEST_REQUIRE_GPU=1` and there is no
+/// adapter: a CI that has a driver must not pass without it.
 pub fn device_for_test(what: &str) -> Option<Arc<Gpu>> {
     limited_device_for_test(what, None)
 }
 
-/// As [`device_for_test`], a device of its own with [`GpuOptions::memory_limit`].
+/// As [`device_for_test`], with a device of its own and [`GpuOptions::memory_limit`].
 ///
 /// # Panics
 /// As [`device_for_test`].
@@ -121,7 +120,7 @@ pub fn limited_device_for_test(what: &str, memory_limit: Option<u64>) -> Option<
             assert!(matches!(error, CoreError::NoAdapter(_)), "{what}: {error}");
             let required = std::env::var("FATHOM_TEST_REQUIRE_GPU").is_ok_and(|value| value == "1");
             assert!(!required, "FATHOM_TEST_REQUIRE_GPU=1, but {what} cannot run: {error}");
-            // Not eprintln: the harness keeps what passing tests say with it to itself.
+            // Not eprintln: the test harness captures its output in tests that pass.
             let _ = writeln!(std::io::stderr().lock(), "\nSKIPPED, NOTHING WAS TESTED: {what}: {error}");
             None
         }
@@ -146,15 +145,15 @@ impl Gpu {
     ///
     /// # Errors
     /// [`CoreError::NoAdapter`] with the package to install, or the flag that allows the CPU;
-    /// [`CoreError::Config`] for a memory limit that cannot be kept.
+    /// [`CoreError::Config`] for a memory limit that cannot be enforced.
     pub fn new(options: GpuOptions) -> Result<Arc<Self>> {
         Self::open(options, None)
     }
 
-    /// Opens a device with a given layout of tiles, so that one machine can test the layouts of others.
+    /// Opens a device with a given tile layout, so that one machine can test the layouts of others.
     ///
     /// # Errors
-    /// As [`Gpu::new`]; also when the adapter has no subgroups of the kind that the layout needs.
+    /// As [`Gpu::new`]; also when the adapter lacks the subgroups that the layout needs.
     pub fn with_layout(options: GpuOptions, layout: TileLayout) -> Result<Arc<Self>> {
         Self::open(options, Some(layout))
     }
@@ -162,8 +161,8 @@ impl Gpu {
     fn open(options: GpuOptions, layout: Option<TileLayout>) -> Result<Arc<Self>> {
         if let Some(limit) = options.memory_limit.filter(|&limit| limit < LEAST_MEMORY_LIMIT) {
             return Err(CoreError::Config(format!(
-                "a limit of {limit} bytes of the GPU's memory leaves no room for any work; it is in bytes and at least \
-                 {LEAST_MEMORY_LIMIT}, 8 GiB are 8589934592"
+                "a GPU memory limit of {limit} bytes leaves no room for any work; it is in bytes and at least \
+                 {LEAST_MEMORY_LIMIT}; 8 GiB is 8589934592"
             )));
         }
         let instance = instance();
@@ -175,8 +174,8 @@ impl Gpu {
         let has = |features| adapter.features().contains(features);
         let subgroup_sizes = info.subgroup_min_size..=info.subgroup_max_size;
         let vectors_of_eight = has(wgpu::Features::SUBGROUP) && subgroup_sizes == (8..=8);
-        // Of 256 threads, shaders have room for 32 subgroups. wgpu says 4 lanes for all of Metal, so it has
-        // the plain forms.
+        // Shaders have room for 32 subgroups in 256 threads. wgpu reports 4 lanes for all of Metal, so Metal
+        // uses the plain kernels.
         let subgroups =
             has(wgpu::Features::SUBGROUP) && *subgroup_sizes.start() >= 8 && *subgroup_sizes.end() <= 128;
         let layout = layout.unwrap_or(match (summary.is_cpu, vectors_of_eight) {
@@ -186,7 +185,10 @@ impl Gpu {
             (true, false) => TileLayout::SMALL,
         });
         if (layout.vector && !vectors_of_eight) || (layout.subgroups && !subgroups) {
-            return Err(CoreError::NoAdapter(format!("{} has no subgroups of that kind", summary.name)));
+            return Err(CoreError::NoAdapter(format!(
+                "{} has no subgroups of the required size",
+                summary.name
+            )));
         }
         let mut features = wgpu::Features::empty();
         features.set(wgpu::Features::TIMESTAMP_QUERY, timestamps);
@@ -202,13 +204,13 @@ impl Gpu {
         let faults = Faults::of(&device);
         if options.memory_limit.is_some() && device.generate_allocator_report().is_none() {
             return Err(CoreError::Config(format!(
-                "a limit of GPU memory cannot be kept: {} does not say what is allocated on {}; \
-                 leave --gpu-memory-limit out",
+                "a GPU memory limit cannot be enforced: {} does not report what is allocated on {}; \
+                 omit --gpu-memory-limit",
                 summary.backend, summary.name
             )));
         }
         if summary.is_cpu {
-            tracing::warn!(adapter = %summary.name, "no GPU is used: this adapter runs on the CPU and is slow");
+            tracing::warn!(adapter = %summary.name, "no GPU is used; this adapter runs on the CPU and is slow");
         }
         let ledger = Ledger::new(options.memory_limit);
         let kernels = Kernels::default();
@@ -226,15 +228,15 @@ impl Gpu {
         }))
     }
 
-    /// What this device runs on.
+    /// The adapter of this device.
     pub fn adapter(&self) -> &AdapterSummary {
         &self.summary
     }
 
-    /// How tiles are laid out here.
+    /// How tiles are laid out on this device.
     ///
-    /// A CPU adapter runs a workgroup as vectors of eight lanes and cannot skip a branch that no lane takes,
-    /// so there a tile is what one vector holds, and the sort does the skipping.
+    /// A CPU adapter runs a workgroup as vectors of eight lanes and cannot skip a branch that no lane takes.
+    /// There a tile is therefore as small as one vector, and the sort does the skipping.
     pub fn layout(&self) -> TileLayout {
         self.layout
     }
@@ -268,10 +270,10 @@ impl Gpu {
         self.timestamps
     }
 
-    /// A zeroed buffer that kernels read as a uniform and others write.
+    /// A zeroed buffer that some kernels read as a uniform and others write.
     ///
     /// # Errors
-    /// [`CoreError::OutOfMemory`] where there is no room.
+    /// [`CoreError::OutOfMemory`] when memory runs out.
     pub fn parameters(&self, label: &'static str, bytes: u64) -> Result<wgpu::Buffer> {
         let buffer = self.allocate(&wgpu::BufferDescriptor {
             label: Some(label),
@@ -289,16 +291,16 @@ impl Gpu {
     /// A zeroed storage buffer.
     ///
     /// # Errors
-    /// [`CoreError::BufferTooLarge`] beyond the binding limit, [`CoreError::OutOfMemory`] where there is no
-    /// room.
+    /// [`CoreError::BufferTooLarge`] beyond the binding limit, [`CoreError::OutOfMemory`] when memory runs
+    /// out.
     pub fn buffer(&self, label: &'static str, bytes: u64) -> Result<wgpu::Buffer> {
-        // What was replaced by now is given back before there is something new.
+        // Releases replaced buffers before the new one is allocated.
         self.kernels.forget_bind_groups();
         self.streamed(label, bytes)
     }
 
-    /// A zeroed storage buffer for what comes and goes while a run trains, such as a photograph. Bind groups
-    /// stay.
+    /// A zeroed storage buffer for data that comes and goes during training, such as a photograph. Bind
+    /// groups stay.
     ///
     /// # Errors
     /// As [`Gpu::buffer`].
@@ -321,13 +323,13 @@ impl Gpu {
         Ok(buffer)
     }
 
-    /// A uniform buffer with content. Where there is no room for it, [`Gpu::check`] will say so.
+    /// An initialised uniform buffer. If memory runs out, [`Gpu::check`] reports it.
     pub fn uniform<T: bytemuck::Pod>(&self, label: &'static str, value: &T) -> wgpu::Buffer {
         let descriptor = wgpu::BufferDescriptor {
             label: Some(label),
             size: (size_of::<T>() as u64).next_multiple_of(wgpu::COPY_BUFFER_ALIGNMENT),
             usage: wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::COPY_DST,
-            // Not mapped: wgpu's helper for buffers with content panics where there is no room.
+            // Not mapped: wgpu's helper for initialised buffers panics when memory runs out.
             mapped_at_creation: false,
         };
         let buffer = self.allocate(&descriptor).unwrap_or_else(|error| {
@@ -338,8 +340,8 @@ impl Gpu {
         buffer
     }
 
-    /// Overwrites the beginning of a buffer before the next submission. Where that fails, [`Gpu::check`] will
-    /// say so.
+    /// Overwrites part of a buffer, from `offset` bytes on, before the next submission. If that fails,
+    /// [`Gpu::check`] reports it.
     pub fn write<T: bytemuck::Pod>(&self, buffer: &wgpu::Buffer, offset: u64, values: &[T]) {
         let bytes = size_of_val(values) as u64;
         if bytes > 0 && self.may_stage(bytes) {
@@ -348,10 +350,10 @@ impl Gpu {
         }
     }
 
-    /// Reads `count` values from `offset` bytes on; waits for all submitted work.
+    /// Reads `count` values from `offset` bytes on. Waits for all submitted work.
     ///
     /// # Errors
-    /// When the device failed before or during the copy, or has no room for it.
+    /// When the device failed before or during the copy, or memory ran out.
     pub fn read<T: bytemuck::Pod>(&self, buffer: &wgpu::Buffer, offset: u64, count: usize) -> Result<Vec<T>> {
         let bytes = (count * size_of::<T>()) as u64;
         if bytes == 0 {
@@ -369,7 +371,7 @@ impl Gpu {
         self.queue.submit([encoder.finish()]);
         let (sender, receiver) = std::sync::mpsc::channel();
         staging.map_async(wgpu::MapMode::Read, .., move |outcome| {
-            // The receiver lives until the wait below is over.
+            // The receiver lives until the wait below has ended.
             let _ = sender.send(outcome);
         });
         self.settle()?;
@@ -391,7 +393,7 @@ impl Gpu {
     /// # Errors
     /// When the device failed.
     pub fn wait(&self) -> Result<()> {
-        // A write alone is not submitted, and holds its staging buffer until it is.
+        // A write is not submitted on its own, and holds its staging buffer until it is.
         self.queue.submit([]);
         self.settle()
     }
@@ -421,7 +423,7 @@ fn choose(mut adapters: Vec<wgpu::Adapter>, options: GpuOptions) -> Result<wgpu:
         let adapter = adapters.swap_remove(index);
         if adapter.get_info().device_type == wgpu::DeviceType::Cpu && !options.allow_cpu {
             return Err(CoreError::NoAdapter(format!(
-                "adapter {index} ({}) runs on the CPU and is slow; say --allow-cpu to use it all the same",
+                "adapter {index} ({}) runs on the CPU and is slow; use --allow-cpu to accept it",
                 adapter.get_info().name
             )));
         }
@@ -430,7 +432,7 @@ fn choose(mut adapters: Vec<wgpu::Adapter>, options: GpuOptions) -> Result<wgpu:
     let first = adapters.swap_remove(0);
     if first.get_info().device_type == wgpu::DeviceType::Cpu && !options.allow_cpu {
         return Err(CoreError::NoAdapter(format!(
-            "the only adapter ({}) runs on the CPU and is slow; say --allow-cpu to use it all the same, \
+            "the only adapter ({}) runs on the CPU and is slow; use --allow-cpu to accept it, \
              or install the driver of your GPU",
             first.get_info().name
         )));

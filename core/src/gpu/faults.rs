@@ -1,7 +1,7 @@
-//! What the device says on its own: errors outside any call that could return them, and its loss.
+//! Faults that the device reports outside any call: errors, and the loss of the device.
 //!
-//! wgpu hands such errors to callbacks. They are kept here until the next call that can return one looks. A
-//! loss stays: whatever is asked of the device afterwards fails with it.
+//! wgpu passes such errors to callbacks. They are kept here until the next call that can return one checks
+//! for them. A loss is permanent: all later calls on the device fail with it.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -9,21 +9,21 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use super::Gpu;
 use crate::{CoreError, Result};
 
-/// What was said and not looked at yet.
+/// Faults that were reported and not yet checked.
 #[derive(Default)]
-pub(super) struct Faults(Mutex<Said>);
+pub(super) struct Faults(Mutex<Pending>);
 
 #[derive(Default)]
-struct Said {
-    /// The first error since the last look; later ones mostly follow from it.
+struct Pending {
+    /// The first error since the last check; later errors are mostly consequences of it.
     first: Option<CoreError>,
     loss: Option<Loss>,
 }
 
 struct Loss {
     message: String,
-    /// wgpu gives a device up when memory of its own ends, that of a write or a submission: it loses the
-    /// device, then reports that there was no memory.
+    /// wgpu gives up a device when it cannot allocate memory for a write or a submission. It first loses the
+    /// device, then reports the lack of memory.
     by_memory: bool,
 }
 
@@ -43,25 +43,25 @@ impl Faults {
             });
         }));
         let kept = Arc::clone(&faults);
-        // Also where the reason is `Destroyed`: nothing here destroys a device, and dropping one does not say
-        // so.
+        // Also for the reason `Destroyed`: nothing here destroys a device, and dropping one does not trigger
+        // the callback.
         device.set_device_lost_callback(move |reason, message| {
             kept.lose(if message.is_empty() { format!("{reason:?}") } else { message });
         });
         faults
     }
 
-    fn lock(&self) -> MutexGuard<'_, Said> {
+    fn lock(&self) -> MutexGuard<'_, Pending> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Keeps an error for the next look.
+    /// Keeps an error for the next check.
     pub(super) fn report(&self, error: CoreError) {
-        let mut said = self.lock();
-        if let (CoreError::OutOfMemory { .. }, Some(loss)) = (&error, &mut said.loss) {
+        let mut pending = self.lock();
+        if let (CoreError::OutOfMemory { .. }, Some(loss)) = (&error, &mut pending.loss) {
             loss.by_memory = true;
         }
-        said.first.get_or_insert(error);
+        pending.first.get_or_insert(error);
     }
 
     fn lose(&self, message: String) {
@@ -75,7 +75,7 @@ impl Faults {
             true => CoreError::OutOfMemory {
                 needed_bytes: None,
                 available_bytes: None,
-                message: format!("the device was lost by it: {message}"),
+                message: format!("the device was lost because of it: {message}"),
             },
         })
     }
@@ -86,24 +86,24 @@ impl Faults {
 }
 
 impl Gpu {
-    /// The error that the device reported on its own since the last look, if any.
+    /// The error that the device reported outside any call since the last check, if any.
     ///
     /// # Errors
-    /// That error. After a loss ([`CoreError::DeviceLost`], or [`CoreError::OutOfMemory`] that wgpu could not
-    /// get over) every call fails with it, and another device must be opened; after all others the device may
-    /// be used on.
+    /// That error. A loss is [`CoreError::DeviceLost`], or [`CoreError::OutOfMemory`] if wgpu could not
+    /// recover. After a loss every call fails with it, and a new device must be opened. After other errors
+    /// the device remains usable.
     pub fn check(&self) -> Result<()> {
         if let Some(loss) = self.faults.loss() {
             return Err(loss);
         }
         let Some(error) = self.faults.take() else { return Ok(()) };
-        // Objects of a lost device are invalid, and using them is an error too; but a loss may be told only
-        // once the device is idle.
+        // Using objects of a lost device is an error too, and the loss may be reported only once the device
+        // is idle.
         self.poll(wgpu::PollType::wait_indefinitely())?;
         Err(self.faults.loss().unwrap_or(error))
     }
 
-    /// Lets wgpu look at what the device has done.
+    /// Lets wgpu process the work that the device has finished.
     ///
     /// # Errors
     /// When the device was lost.
@@ -112,16 +112,16 @@ impl Gpu {
     }
 }
 
-/// The outcome of `poll`. wgpu 30 panics in it, holding none of its locks, where the driver reports a loss
-/// during a wait.
+/// The outcome of `poll`. If the driver reports a loss during a wait, wgpu 30 panics in `poll`, without
+/// holding any of its locks.
 fn polled(faults: &Faults, poll: impl FnOnce() -> Result<wgpu::PollStatus, wgpu::PollError>) -> Result<()> {
     match catch_unwind(AssertUnwindSafe(poll)) {
         Ok(Ok(_)) => Ok(()),
         Ok(Err(error)) => Err(CoreError::Gpu(format!("waiting for the device: {error}"))),
         Err(panic) => {
-            let said = panic.downcast_ref::<String>().map(String::as_str);
-            let said = said.or_else(|| panic.downcast_ref::<&str>().copied());
-            faults.lose(said.unwrap_or("wgpu panicked while it waited").to_owned());
+            let message = panic.downcast_ref::<String>().map(String::as_str);
+            let message = message.or_else(|| panic.downcast_ref::<&str>().copied());
+            faults.lose(message.unwrap_or("wgpu panicked while it waited").to_owned());
             Err(faults.loss().unwrap_or_else(|| CoreError::Gpu("waiting for the device".into())))
         }
     }
@@ -136,7 +136,7 @@ mod tests {
     }
 
     #[test]
-    fn a_panic_of_wgpu_while_it_waits_is_a_loss_with_the_drivers_words() {
+    fn a_panic_in_poll_is_a_loss_with_the_drivers_message() {
         let faults = Faults::default();
         let error = polled(&faults, || {
             faults.lose("Device is lost".into());
@@ -150,7 +150,7 @@ mod tests {
     }
 
     #[test]
-    fn a_device_that_wgpu_gave_up_for_want_of_memory_is_out_of_memory() {
+    fn a_device_lost_for_lack_of_memory_is_out_of_memory() {
         let faults = Faults::default();
         faults.lose("Out of memory".into());
         assert!(matches!(faults.loss(), Some(CoreError::DeviceLost { .. })));
@@ -160,11 +160,14 @@ mod tests {
         let faults = Faults::default();
         faults.report(out_of_memory());
         faults.lose("unplugged".into());
-        assert!(matches!(faults.loss(), Some(CoreError::DeviceLost { .. })), "memory ended long before");
+        assert!(
+            matches!(faults.loss(), Some(CoreError::DeviceLost { .. })),
+            "that error is older than the loss"
+        );
     }
 
     #[test]
-    fn the_first_error_is_kept_and_told_once() {
+    fn the_first_error_is_kept_and_reported_once() {
         let faults = Faults::default();
         faults.report(CoreError::Gpu("first".into()));
         faults.report(CoreError::Gpu("second".into()));

@@ -1,10 +1,10 @@
 //! The lists of one view and the recording of the forward pass.
 //!
 //! cull -> scan -> count_visible -> project_forward -> depth sort -> intersect_count -> scan ->
-//! count_intersections -> intersect_emit -> tile sort -> tile_ranges -> rasterize_forward. No count comes
-//! back to the host within an iteration: sizes travel as indirect dispatches, and a list that is too short
-//! sets a sticky bit (see `count_visible.wgsl`) that the host looks at later. A view whose lists would be
-//! longer than a binding may be is rendered in bands of tiles, one after the other.
+//! count_intersections -> intersect_emit -> tile sort -> tile_ranges -> rasterize_forward.
+//! The host reads no count back within an iteration: sizes are passed on as indirect dispatches. A list that
+//! is too short sets a sticky bit (see `count_visible.wgsl`), which the host checks later. A view whose lists
+//! would exceed the largest binding is rendered in bands of tiles, one after the other.
 
 use super::layout::{DEPTH_BITS, FrameUniform, WaterUniform, counter};
 use super::{Blocks, Gpu, Recorder, Scan, Size, Sort};
@@ -12,18 +12,18 @@ use crate::memory::{LONGEST_ROW_BYTES, most_rows};
 use crate::water::Water;
 use crate::{CoreError, Result};
 
-/// Which list was too short, and for what.
+/// A list that was too short, and the length it needed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Overflow {
-    /// Iteration that failed first; it and all later ones did nothing.
+    /// First iteration that failed; it and all later ones did nothing.
     pub failed_at: u32,
-    /// Visible Gaussians that it needed, or 0.
+    /// Visible Gaussians that it needed; 0 if they fitted.
     pub visible: u32,
-    /// Intersections that it needed, or 0.
+    /// Intersections that it needed; 0 if they fitted.
     pub intersections: u32,
 }
 
-/// Most entries that the lists of a view may have; a view that needs more is rendered in bands of tiles.
+/// Maximum lengths of the lists of a view. A view that needs more is rendered in bands of tiles.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ListLimits {
     /// Visible Gaussians.
@@ -33,17 +33,18 @@ pub struct ListLimits {
 }
 
 impl ListLimits {
-    /// What the device can bind.
+    /// The limits of the device's bindings.
     pub fn of(gpu: &Gpu) -> Self {
         let limits = gpu.device().limits();
         let rows = most_rows(limits.max_storage_buffer_binding_size.min(limits.max_buffer_size));
         Self { visible: rows, intersections: rows }
     }
 
-    /// How many bands a view needs that overflowed with `bands`: more, by what was missing and a fifth.
+    /// Number of bands for a view that overflowed with `bands`: more by the ratio of needed to allowed
+    /// length, plus a fifth.
     ///
     /// # Errors
-    /// [`CoreError::BufferTooLarge`] when every tile is a band already.
+    /// [`CoreError::BufferTooLarge`] when every band is already a single tile.
     pub fn more_bands(&self, overflow: Overflow, bands: u32, tiles: u32) -> Result<u32> {
         if bands >= tiles {
             return Err(CoreError::BufferTooLarge {
@@ -67,7 +68,7 @@ impl Overflow {
     }
 }
 
-/// Buffers of a picture's size.
+/// Buffers whose size depends on the image.
 pub struct FrameTargets {
     /// `[H*W]` vec4: rgb, alpha.
     pub image: wgpu::Buffer,
@@ -83,15 +84,15 @@ pub struct FrameTargets {
 
 /// The lists of one view.
 pub struct Frame {
-    /// `FrameUniform` of the iteration being recorded.
+    /// `FrameUniform` of the recorded iteration.
     pub uniform: wgpu::Buffer,
-    /// `WaterUniform` of what is between camera and scene; read where [`FrameUniform::medium`] is set.
+    /// `WaterUniform` of the water between camera and scene; read if [`FrameUniform::medium`] is set.
     pub water: wgpu::Buffer,
     /// See [`counter`].
     pub counters: wgpu::Buffer,
     /// Indirect arguments.
     pub args: wgpu::Buffer,
-    /// `[gaussians]`; after the forward: number of visible ones before each.
+    /// `[gaussians]`; after the forward pass: number of visible Gaussians before each.
     pub flags: wgpu::Buffer,
     /// `[visible*3]` vec4.
     pub projected: wgpu::Buffer,
@@ -105,7 +106,7 @@ pub struct Frame {
     intersect_capacity: u32,
     gaussian_capacity: u32,
     limits: ListLimits,
-    /// In place of `density_sums` of frozen blocks: one row of zeros, no smoothing.
+    /// Replaces `density_sums` in frozen blocks: one row of zeros, no smoothing.
     no_density_sums: wgpu::Buffer,
     offsets: wgpu::Buffer,
     flag_scan: Scan,
@@ -150,17 +151,17 @@ impl Frame {
         })
     }
 
-    /// Visible Gaussians and intersections that fit.
+    /// Capacities: visible Gaussians and intersections.
     pub fn capacities(&self) -> (u32, u32) {
         (self.visible_capacity, self.intersect_capacity)
     }
 
-    /// Longest lists; see [`Frame::with_limits`].
+    /// Maximum lengths of the lists; see [`Frame::with_limits`].
     pub fn limits(&self) -> ListLimits {
         self.limits
     }
 
-    /// The same with other limits than those of the device, at most those: tests.
+    /// The same with tighter limits than those of the device, for tests.
     #[must_use]
     pub fn with_limits(mut self, limits: ListLimits) -> Self {
         self.limits = limits;
@@ -172,19 +173,19 @@ impl Frame {
         self.set_water_uniform(gpu, WaterUniform::from(water));
     }
 
-    /// The same with all that the device knows of a water.
+    /// As [`Frame::set_water`], with all parameters of a water on the device.
     pub fn set_water_uniform(&self, gpu: &Gpu, water: WaterUniform) {
         gpu.write(&self.water, 0, &[water]);
     }
 
-    /// The nine numbers alone: how they follow from range and direction stays.
+    /// Sets the water parameters only; their dependence on range and direction stays.
     pub fn set_nine(&self, gpu: &Gpu, water: &Water) {
         for (row, values) in [water.beta_d, water.beta_b, water.b_inf].into_iter().enumerate() {
             gpu.write(&self.water, 16 * row as u64, &values.map(|value| value as f32));
         }
     }
 
-    /// Gaussians that fit.
+    /// Capacity in Gaussians.
     pub fn gaussian_capacity(&self) -> u32 {
         self.gaussian_capacity
     }
@@ -201,7 +202,7 @@ impl Frame {
         )
     }
 
-    /// Buffers that a forward pass must write before it reads them: tests fill them with rubbish first.
+    /// Buffers that a forward pass must write before it reads them. Tests fill them with garbage first.
     pub fn scratch(&self) -> Vec<&wgpu::Buffer> {
         let mut buffers = vec![
             &self.args,
@@ -223,12 +224,12 @@ impl Frame {
         buffers
     }
 
-    /// The slots sorted by tile after the forward of a picture with `tiles` tiles.
+    /// The slots sorted by tile, after the forward pass of an image with `tiles` tiles.
     pub fn sorted_slots(&self, tiles: u32) -> &wgpu::Buffer {
         &self.tile_sort.values[Sort::result(tile_bits(tiles))]
     }
 
-    /// Ranks to visible ids after the forward: front to back.
+    /// Visible ids by depth rank, front to back, after the forward pass.
     pub fn depth_order(&self) -> &wgpu::Buffer {
         &self.depth_sort.values[Sort::result(DEPTH_BITS)]
     }
@@ -238,7 +239,7 @@ impl Frame {
         &self.tile_sort.keys[Sort::result(tile_bits(tiles))]
     }
 
-    /// Targets with room for a picture of the given size; kept while they are large enough.
+    /// Makes targets for an image of the given size, or keeps those that are large enough.
     ///
     /// # Errors
     /// When the device cannot bind them.
@@ -249,7 +250,7 @@ impl Frame {
         if self.targets.is_some() && have_pixels >= pixels && have_tiles >= tiles {
             return Ok(());
         }
-        // Pictures of two shapes may need most pixels and most tiles by turns.
+        // Of two image shapes, one may need more pixels and the other more tiles.
         let (pixels, tiles) = (pixels.max(have_pixels), tiles.max(have_tiles));
         self.targets = None;
         self.targets = Some(FrameTargets {
@@ -273,8 +274,8 @@ impl Frame {
             .ok_or_else(|| CoreError::Gpu("a frame was recorded before its targets were made".into()))
     }
 
-    /// Records the forward pass of one view, or of the band of it that `view` names. `view` is completed with
-    /// counts and capacities here.
+    /// Records the forward pass of one view, or of the band that `view` selects. This fills in the counts and
+    /// capacities of `view`.
     ///
     /// # Errors
     /// When a kernel does not compile or targets are missing.
@@ -304,8 +305,7 @@ impl Frame {
         )
     }
 
-    /// Records which Gaussians a view may see, and how many: flags and counters only, so no list can be too
-    /// short.
+    /// Records the visibility test of a view: flags and counters only, so no list can overflow.
     ///
     /// # Errors
     /// When a kernel does not compile.
@@ -319,7 +319,7 @@ impl Frame {
         self.record_cull(gpu, recorder, blocks, &FrameUniform { visible_capacity: u32::MAX, ..*view })
     }
 
-    /// Records the kernels up to the number of visible Gaussians, within the capacities that `view` names.
+    /// Records the kernels up to the number of visible Gaussians, within the capacities of `view`.
     fn record_cull(
         &self,
         gpu: &Gpu,
@@ -380,7 +380,7 @@ impl Frame {
         )
     }
 
-    /// Records everything before the blending: what each tile sees, front to back.
+    /// Records everything before the blending: the splats of each tile, front to back.
     ///
     /// # Errors
     /// When a kernel does not compile or targets are missing.
@@ -469,7 +469,8 @@ impl Frame {
         )
     }
 
-    /// Waits and looks whether a list was too short since these lists were made or [`Frame::grow`] made room.
+    /// Waits and reports whether a list was too short since the lists were made or [`Frame::grow`] was
+    /// called.
     ///
     /// # Errors
     /// When the device failed.
@@ -483,7 +484,7 @@ impl Frame {
         }))
     }
 
-    /// Capacities with room for what overflowed and a quarter more, as far as the limits allow.
+    /// Capacities with room for what overflowed plus a quarter, within the limits.
     pub fn capacities_for(&self, overflow: Overflow) -> (u32, u32) {
         let roomy = |have: u32, need: u32, most: u32| {
             if need > have { need.saturating_add(need / 4).min(most).max(have) } else { have }
@@ -494,7 +495,7 @@ impl Frame {
         )
     }
 
-    /// Lists with [`Frame::capacities_for`] what overflowed; the sticky bit is clear.
+    /// Grows the lists to [`Frame::capacities_for`] the overflow and clears the sticky bit.
     ///
     /// # Errors
     /// When the device cannot hold them.
@@ -504,7 +505,7 @@ impl Frame {
             self.forget_overflow(gpu);
             return Ok(());
         }
-        // The old lists go first: both together could be the most memory that is ever taken.
+        // The old lists are freed first: both together could be the peak of memory use.
         for (visible, intersections) in [(1, 1), (visible, intersections)] {
             self.replace_lists(gpu, visible, intersections)?;
             gpu.release_unused()?;
@@ -512,10 +513,10 @@ impl Frame {
         Ok(())
     }
 
-    /// New lists in place of the old ones, with the same targets and limits; the sticky bit is clear.
+    /// Replaces the lists, keeping targets and limits, and clears the sticky bit.
     ///
     /// # Errors
-    /// When the device cannot hold them beside the old ones, which then stay.
+    /// When the device cannot hold them in addition to the old ones, which then stay.
     pub fn replace_lists(&mut self, gpu: &Gpu, visible: u32, intersections: u32) -> Result<()> {
         let new = Self::new(gpu, self.gaussian_capacity, visible, intersections)?.with_limits(self.limits);
         let targets = self.targets.take();
@@ -534,7 +535,7 @@ impl Frame {
     }
 }
 
-/// Bits of a tile's number, with one number for entries that nobody reads.
+/// Bits of a tile number; one more number marks entries that no kernel reads.
 fn tile_bits(tiles: u32) -> u32 {
     u32::BITS - tiles.leading_zeros()
 }

@@ -12,12 +12,12 @@ include!(concat!(env!("OUT_DIR"), "/shaders.rs"));
 /// How kernels are laid out on an adapter.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct TileLayout {
-    /// Side of a tile, pixels: a multiple of 8.
+    /// Side of a tile, pixels; a multiple of 8.
     pub tile: u32,
-    /// Whether the threads of a tile are the lanes of one vector (then `tile` is 8): imports named `exchange`
-    /// and `sums` are taken from the files that end in `_vector`, else `_workgroup`.
+    /// Whether the threads of a tile are the lanes of one vector (then `tile` is 8). If so, the imports
+    /// `exchange` and `sums` are the files that end in `_vector`, otherwise those that end in `_workgroup`.
     pub vector: bool,
-    /// Whether scans and sorts are taken from the files that end in `_subgroups`, where there are such.
+    /// Whether scans and sorts use the files that end in `_subgroups`, where they exist.
     pub subgroups: bool,
 }
 
@@ -30,7 +30,7 @@ impl TileLayout {
     pub const VECTOR: Self = Self { tile: 8, vector: true, subgroups: false };
     /// For other CPU adapters.
     pub const SMALL: Self = Self { tile: 8, vector: false, subgroups: false };
-    /// All of them.
+    /// All layouts.
     pub const ALL: [Self; 4] = [Self::GPU, Self::PLAIN_GPU, Self::VECTOR, Self::SMALL];
 
     /// Whether its shaders need subgroups.
@@ -39,19 +39,19 @@ impl TileLayout {
     }
 }
 
-/// Begins a line that names a kernel and the files that imports stand for in it:
+/// Start of a line that names a kernel and the files that replace imports in it:
 /// `//@ variant NAME light=water+light_linear`.
 const VARIANT: &str = "//@ variant ";
 
-/// A kernel that is made from a file, with what some of its imports stand for.
+/// A kernel that is made from a file, with the files that replace some of its imports.
 struct Variant {
     name: &'static str,
-    /// Import, and the files that it stands for.
+    /// Import, and the files that replace it.
     imports: Vec<(&'static str, Vec<&'static str>)>,
 }
 
 impl Variant {
-    /// Those that the head of a file names.
+    /// The variants that the header of a file declares.
     fn of(text: &'static str) -> impl Iterator<Item = Self> {
         text.lines().filter_map(|line| line.strip_prefix(VARIANT)).filter_map(|line| {
             let mut words = line.split_whitespace();
@@ -67,7 +67,7 @@ impl Variant {
     }
 }
 
-/// The file that a kernel is made from, by name, and the variant where the file has some.
+/// The file that a kernel is made from, by name, and its variant if the file declares any.
 fn file_of(kernel: &str) -> (&str, Option<Variant>) {
     let variants =
         STAGES.iter().flat_map(|(file, text)| Variant::of(text).map(move |variant| (*file, variant)));
@@ -77,19 +77,19 @@ fn file_of(kernel: &str) -> (&str, Option<Variant>) {
     }
 }
 
-/// Names of the files of `shaders/`, each a kernel.
+/// Names of the files of `shaders/`; each is a kernel.
 pub fn kernel_names() -> impl Iterator<Item = &'static str> {
     STAGES.iter().map(|(name, _)| *name)
 }
 
-/// Names of the kernels that are made from the file of another with other imports.
+/// Names of the kernels that are made from the file of another kernel with different imports.
 pub fn kernel_variants() -> impl Iterator<Item = &'static str> {
     let variants = STAGES.iter().flat_map(|(_, text)| Variant::of(text)).map(|variant| variant.name);
     variants.filter(|name| STAGES.iter().all(|(file, _)| file != name))
 }
 
-/// The whole WGSL of a kernel: the tile's size, what the kernel's first line `//@ import a, b` names from
-/// `shaders/shared/`, then itself.
+/// The complete WGSL of a kernel: the tile size, the files of `shaders/shared/` that its first line
+/// `//@ import a, b` names, then the kernel itself.
 ///
 /// # Errors
 /// When the kernel or an import does not exist.
@@ -152,10 +152,10 @@ impl Kernel {
         let shader = if gpu.shader_checks() {
             gpu.device().create_shader_module(descriptor)
         } else {
-            // SAFETY: only the kernels of `shaders/` come here. They index by counts that kernels before them
-            // made and clamped to the lengths of the lists, and every loop counts up to one; that checks
-            // change no byte of what they write, also with rubbish in every buffer and lists that are too
-            // short, is tested in `core/tests/kernels`.
+            // SAFETY: only the kernels of `shaders/` come here. They index by counts that earlier kernels
+            // computed and clamped to the lengths of the lists, and every loop counts up to such a count.
+            // `core/tests/kernels` tests that the checks change no byte of the output, even with garbage in
+            // every buffer and with lists that are too short.
             unsafe {
                 gpu.device().create_shader_module_trusted(descriptor, wgpu::ShaderRuntimeChecks::unchecked())
             }
@@ -227,8 +227,8 @@ impl Kernels {
         Ok(Arc::clone(cell.get_or_init(|| kernel)))
     }
 
-    /// Drops all bind groups, so that buffers that were replaced can be freed: called before a buffer is
-    /// made, and where memory is given back. Nobody who replaces a buffer needs to know of them.
+    /// Drops all bind groups, so that replaced buffers can be freed. Called before a buffer is created and
+    /// when memory is released, so code that replaces a buffer does not have to call it.
     pub(super) fn forget_bind_groups(&self) {
         let Ok(compiled) = self.compiled.lock() else { return };
         for kernel in compiled.values().filter_map(|cell| cell.get()) {
@@ -239,14 +239,14 @@ impl Kernels {
     }
 }
 
-/// How many workgroups a dispatch has.
+/// Number of workgroups of a dispatch.
 #[derive(Clone, Copy)]
 pub enum Size<'a> {
     /// Known to the host; folded into two dimensions.
     Groups(u32),
-    /// One thread an item, this many threads a group.
+    /// One thread per item; the second number is threads per group.
     Items(u32, u32),
-    /// Made by a `count_*` kernel: slot of the argument buffer.
+    /// Computed by a `count_*` kernel; the slot of the argument buffer.
     Indirect(&'a wgpu::Buffer, u32),
 }
 
@@ -255,9 +255,9 @@ pub enum Size<'a> {
 pub struct KernelTime {
     /// The kernel.
     pub kernel: &'static str,
-    /// Seconds on the device, all its dispatches together.
+    /// Seconds on the device, summed over its dispatches.
     pub seconds: f64,
-    /// Dispatches.
+    /// Number of dispatches.
     pub dispatches: u32,
 }
 
@@ -272,7 +272,7 @@ fn add_time(times: &mut Vec<KernelTime>, kernel: &'static str, seconds: f64) {
     }
 }
 
-/// Records dispatches into one submission; with timing on, one pass a dispatch.
+/// Records dispatches into one submission; with timing on, each dispatch is a pass of its own.
 pub struct Recorder<'g> {
     gpu: &'g Gpu,
     encoder: wgpu::CommandEncoder,
@@ -288,7 +288,7 @@ struct Stepping {
 struct Timing {
     queries: wgpu::QuerySet,
     names: Vec<&'static str>,
-    /// Dispatches beyond what there are queries for.
+    /// Dispatches without a query.
     untimed: u32,
 }
 
@@ -301,14 +301,14 @@ impl<'g> Recorder<'g> {
         Self { gpu, encoder, timing: None, stepping: None }
     }
 
-    /// An empty recording of which every dispatch runs at once, alone, and takes the time by `clock`,
-    /// seconds. With a clock of CPU time this is what a kernel costs on a CPU adapter, whatever else the
-    /// machine does.
+    /// An empty recording that runs every dispatch immediately, alone, and times it with `clock`, seconds.
+    /// With a clock of CPU time this measures the cost of a kernel on a CPU adapter, regardless of other
+    /// load.
     pub fn stepped(gpu: &'g Gpu, clock: fn() -> f64) -> Self {
         Self { stepping: Some(Stepping { clock, times: Vec::new() }), ..Self::new(gpu) }
     }
 
-    /// An empty recording whose dispatches are timed, where the device can.
+    /// An empty recording whose dispatches are timed, if the device supports it.
     pub fn timed(gpu: &'g Gpu) -> Self {
         let mut recorder = Self::new(gpu);
         if gpu.has_timestamps() {
@@ -322,7 +322,7 @@ impl<'g> Recorder<'g> {
         recorder
     }
 
-    /// Appends one dispatch. `buffers` are given by the names of the shader's variables.
+    /// Appends one dispatch. `buffers` are matched to the shader's variables by name.
     ///
     /// # Errors
     /// When the shader does not compile or a name is not one of its bindings.
@@ -383,7 +383,7 @@ impl<'g> Recorder<'g> {
         Ok(())
     }
 
-    /// Copies all of a buffer to the beginning of another.
+    /// Copies a whole buffer to the beginning of another.
     pub fn copy(&mut self, from: &wgpu::Buffer, to: &wgpu::Buffer) {
         self.encoder.copy_buffer_to_buffer(from, 0, to, 0, from.size().min(to.size()));
     }
@@ -393,19 +393,19 @@ impl<'g> Recorder<'g> {
         self.encoder.clear_buffer(buffer, 0, None);
     }
 
-    /// Submits what was recorded so far; what follows is another submission, and sees other uniforms.
+    /// Submits the recording so far. Later dispatches are another submission and see later uniform writes.
     pub fn flush(&mut self) {
         let next = self.gpu.device().create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
         let recorded = std::mem::replace(&mut self.encoder, next);
         self.gpu.queue().submit([recorded.finish()]);
     }
 
-    /// Submits what was recorded.
+    /// Submits the recording.
     pub fn submit(self) {
         self.gpu.queue().submit([self.encoder.finish()]);
     }
 
-    /// Submits, waits, and gives the time of each kernel in the order of first use.
+    /// Submits, waits, and returns the time of each kernel in the order of first use.
     ///
     /// # Errors
     /// When the device fails.
@@ -421,10 +421,7 @@ impl<'g> Recorder<'g> {
             return Ok(Vec::new());
         };
         if timing.untimed > 0 {
-            tracing::warn!(
-                timing.untimed,
-                "dispatches beyond {MAX_TIMED} are not in the times of the kernels"
-            );
+            tracing::warn!(timing.untimed, "dispatches beyond {MAX_TIMED} are missing from the kernel times");
         }
         let count = 2 * timing.names.len() as u32;
         let resolved = self.gpu.device().create_buffer(&wgpu::BufferDescriptor {

@@ -1,5 +1,5 @@
-//! Mirrors of the uniform structs and counters of `shaders/shared/`. A test compares every offset with
-//! naga's.
+//! Mirrors of the uniform structs and counters of `shaders/shared/`. A test compares every offset with naga's
+//! reflection.
 
 use bytemuck::{Pod, Zeroable};
 use glam::DVec3;
@@ -9,13 +9,13 @@ use crate::memory::MAX_TILES;
 use crate::scene::{PinholeCamera, Pose};
 use crate::water::{ByDirection, RangeModulation, Water};
 
-/// Counts that a scan's workgroup takes.
+/// Counts per workgroup of a scan.
 pub(crate) const SCAN_CHUNK: u32 = 1024;
-/// Keys that a sort's workgroup takes.
+/// Keys per workgroup of a sort.
 pub(crate) const SORT_CHUNK: u32 = 2048;
-/// Digits of a sort's pass.
+/// Digit values per pass of a sort.
 pub(crate) const SORT_BINS: u32 = 64;
-/// Bits of a sort's pass.
+/// Bits per pass of a sort.
 pub(crate) const SORT_BITS: u32 = 6;
 /// Bits of a depth key: z from NEAR to beyond 1e36.
 pub(crate) const DEPTH_BITS: u32 = 30;
@@ -75,8 +75,8 @@ pub struct FrameUniform {
 }
 
 impl FrameUniform {
-    /// The part that a camera decides; counts and capacities are filled in by the frame; `tile` as
-    /// [`super::Gpu::tile`] gives it.
+    /// The part that depends on the camera; the frame fills in counts and capacities. `tile` as given by
+    /// [`super::Gpu::tile`].
     pub fn of_camera(camera: &PinholeCamera, pose: &Pose, tile: u32) -> Self {
         let rotation = glam::DMat3::from_quat(pose.rotation);
         let t = pose.translation;
@@ -85,7 +85,7 @@ impl FrameUniform {
             [r.x as f32, r.y as f32, r.z as f32, t[i] as f32]
         };
         let (w, h) = (f64::from(camera.width), f64::from(camera.height));
-        // 15 % of the picture's width outside each edge (gsplat): 0.3 * tan(half the field of view).
+        // 15 % of the image size outside each edge (gsplat): 0.3 * tan(half the field of view).
         let margin = [0.15 * w / camera.fx, 0.15 * h / camera.fy];
         Self {
             view_x: row(0),
@@ -107,7 +107,7 @@ impl FrameUniform {
         .with_size([camera.width, camera.height], tile)
     }
 
-    /// The same with a picture of another size, all of which is worked on.
+    /// The same for an image of another size, all of which is processed.
     pub fn with_size(self, [width, height]: [u32; 2], tile: u32) -> Self {
         let tiles = [width.div_ceil(tile), height.div_ceil(tile)];
         Self {
@@ -121,12 +121,12 @@ impl FrameUniform {
         }
     }
 
-    /// The same view with work on tiles `first..end` only, in reading order; `tile` as [`super::Gpu::tile`]
-    /// gives it.
+    /// The same view limited to tiles `first..end`, in reading order; `tile` as given by
+    /// [`super::Gpu::tile`].
     pub fn with_band(&self, tiles: std::ops::Range<u32>, tile: u32) -> Self {
         let columns = self.tiles[0].max(1);
         let (top, bottom) = (tiles.start / columns, (tiles.end.max(1) - 1) / columns);
-        // A band inside one row of tiles is as narrow as it; any other is as wide as the picture.
+        // A band inside one row of tiles is as narrow as its tiles; any other is as wide as the image.
         let (left, right) =
             if top == bottom { (tiles.start % columns, (tiles.end - 1) % columns) } else { (0, columns - 1) };
         let edge = |index: u32, size: u32| ((index + 1) * tile).min(size) as f32;
@@ -139,14 +139,14 @@ impl FrameUniform {
         }
     }
 
-    /// In how many bands the view is rendered where `count` would be enough for the lists: more where it has
-    /// too many tiles, at most as many as it has tiles.
+    /// Number of bands for a view whose lists need `count` bands: more if it has too many tiles, at most one
+    /// per tile.
     pub fn band_count(&self, count: u32) -> u32 {
         let tiles = self.tile_count();
         count.max(tiles.div_ceil(MAX_TILES)).clamp(1, tiles.max(1))
     }
 
-    /// The view cut into [`FrameUniform::band_count`] bands of as many tiles each; one band is the view
+    /// The view cut into [`FrameUniform::band_count`] bands of equally many tiles. One band is the view
     /// itself.
     pub fn bands(&self, count: u32, tile: u32) -> Vec<Self> {
         let (tiles, count) = (self.tile_count(), self.band_count(count));
@@ -211,7 +211,7 @@ pub struct LossUniform {
 }
 
 impl LossUniform {
-    /// For one channel of a picture.
+    /// For one channel of an image.
     pub fn new(size: [u32; 2], channel: u32, masked: bool, ssim_weight: f32, log_at: u32) -> Self {
         let window = window();
         let weight =
@@ -278,7 +278,7 @@ pub mod medium {
     use super::Output;
     use crate::config::Composition;
 
-    /// The value with which a scene under water is rendered, to show this of it.
+    /// The value that renders `output` of a scene under water.
     pub(crate) fn of(composition: Composition, output: Output) -> u32 {
         match (composition, output) {
             (Composition::GaussiansSrgb, Output::Underwater) => PER_GAUSSIAN_SRGB,
@@ -319,7 +319,7 @@ impl From<&Water> for WaterUniform {
 }
 
 impl WaterUniform {
-    /// The same with coefficients that follow from range.
+    /// The same with coefficients that depend on range.
     #[must_use]
     pub fn with_refinement(self, refinement: &RangeModulation) -> Self {
         Self {
@@ -425,8 +425,8 @@ pub struct PriorsUniform {
     pub pad1: f32,
 }
 
-/// Rows of partial sums of `water_gradients` for so many Gaussians in so many blocks, the last of which is as
-/// full as it gets.
+/// Rows of partial sums of `water_gradients` for this many Gaussians in this many blocks. The last block
+/// counts as full.
 pub(crate) fn water_rows(gaussians: u32, blocks: u32) -> u32 {
     gaussians.div_ceil(64) + blocks + 1
 }

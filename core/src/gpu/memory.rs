@@ -1,12 +1,12 @@
-//! What is allocated on the device, what may be, and what happens when there is no more.
+//! Device memory: what is allocated, the limit, and what happens when memory runs out.
 //!
-//! The ledger is wgpu's own: its allocator knows every buffer from its creation until the last clone is
-//! dropped and the device is done with it, staging buffers of writes included. So nothing needs to be told
-//! when a buffer ends, and what is counted is what the driver was asked for. Metal's allocator does not
-//! report: there nothing is counted.
+//! The ledger is that of wgpu. Its allocator knows every buffer, including the staging buffers of writes,
+//! from its creation until its last clone is dropped and the device has finished with it. So nothing has to
+//! report the end of a buffer, and the counts are what the driver was asked for. Metal's allocator has no
+//! report: nothing is counted there.
 //!
-//! A buffer that is refused is tried again after everything that nobody holds any more has been given back,
-//! and once more without what is there for speed alone ([`Spare`]).
+//! If an allocation is refused, it is retried after unused buffers have been released. The last attempt is
+//! made after dropping everything that is kept only for speed ([`Spare`]).
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -17,28 +17,29 @@ use crate::error::Size;
 use crate::memory::STAGED_BYTES;
 use crate::{CoreError, Result};
 
-/// Smaller writes do not count towards the peak and the limit: a look at the allocator takes some 15
+/// Smaller writes count towards neither the peak nor the limit: a query of the allocator takes some 15
 /// microseconds.
 const SMALLEST_COUNTED_WRITE: u64 = 1 << 20;
 
-/// Memory of a device as wgpu's allocator has it, bytes.
+/// Memory of a device according to wgpu's allocator, bytes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct DeviceMemory {
-    /// In buffers that live: made by [`Gpu`], staging of writes, and half a MiB of wgpu's own. Each size is
-    /// what was asked for, rounded up to the driver's alignment.
+    /// In live buffers: made by [`Gpu`], staging of writes, and half a MiB of wgpu's own. Each size is the
+    /// requested one, rounded up to the driver's alignment.
     pub allocated_bytes: u64,
-    /// Largest `allocated_bytes` since the device was opened or [`Gpu::reset_peak`]; looked at whenever
-    /// something of size is allocated.
+    /// Largest `allocated_bytes` since the device was opened or [`Gpu::reset_peak`], sampled at every large
+    /// allocation.
     pub peak_bytes: u64,
-    /// In the driver's blocks from which buffers are cut, free parts included: what other programs see.
+    /// In the driver's blocks that buffers are allocated from, free parts included: what other programs see.
     pub reserved_bytes: u64,
     /// [`GpuOptions::memory_limit`](super::GpuOptions::memory_limit).
     pub limit_bytes: Option<u64>,
 }
 
-/// Buffers that are kept because they may be needed again, and can be made again.
+/// Buffers that are kept for reuse and can be recreated.
 pub trait Spare: Send + Sync {
-    /// Drops them. Called from within an allocation, so no lock may be held around one that is taken here.
+    /// Drops them. Called during an allocation, so callers must not hold a lock that this takes while they
+    /// allocate.
     fn drop_all(&self);
 }
 
@@ -47,7 +48,7 @@ pub trait Spare: Send + Sync {
 pub(super) struct Ledger {
     limit: Option<u64>,
     peak: AtomicU64,
-    /// Bytes written since the device was last waited for.
+    /// Bytes written since the last wait for the device.
     staged: AtomicU64,
     spares: Mutex<Vec<Weak<dyn Spare>>>,
 }
@@ -57,22 +58,22 @@ impl Ledger {
         Self { limit, ..Self::default() }
     }
 
-    /// Everything that was written is where it belongs.
+    /// Records that all writes have reached the device.
     pub(super) fn nothing_is_staged(&self) {
         self.staged.store(0, Ordering::Relaxed);
     }
 }
 
-/// Who refused, where it was not the driver.
+/// The refusal of an allocation by the limit, not by the driver.
 #[derive(Debug, thiserror::Error)]
-#[error("beyond the limit that was set")]
+#[error("beyond the memory limit")]
 struct BeyondLimit;
 
 impl Gpu {
-    /// What is allocated now; `None` where the backend does not say (Metal).
+    /// Memory in use; `None` if the backend does not report it (Metal).
     pub fn memory(&self) -> Option<DeviceMemory> {
-        // What the device is done with is given back in a poll. A loss shows in the next call that can return
-        // it.
+        // A poll releases what the device has finished with. The next call that can return an error reports a
+        // loss.
         let _ = self.poll(wgpu::PollType::Poll);
         let report = self.device.generate_allocator_report()?;
         let allocated_bytes = report.total_allocated_bytes;
@@ -85,7 +86,7 @@ impl Gpu {
         })
     }
 
-    /// [`DeviceMemory::allocated_bytes`] by the label of the buffers.
+    /// [`DeviceMemory::allocated_bytes`] by buffer label.
     pub fn memory_by_label(&self) -> Option<BTreeMap<String, u64>> {
         let mut bytes = BTreeMap::new();
         for allocation in self.device.generate_allocator_report()?.allocations {
@@ -94,12 +95,12 @@ impl Gpu {
         Some(bytes)
     }
 
-    /// Begins to look for the peak anew.
+    /// Restarts the peak at the current allocation.
     pub fn reset_peak(&self) {
         self.ledger.peak.store(self.allocated().unwrap_or(0), Ordering::Relaxed);
     }
 
-    /// Forgets what is kept for speed alone and waits, so that buffers that nobody else holds are given back.
+    /// Drops cached bind groups and waits, so that buffers without other owners are released.
     ///
     /// # Errors
     /// When the device failed.
@@ -108,7 +109,7 @@ impl Gpu {
         self.wait()
     }
 
-    /// Has `spare` dropped whenever memory is short, for as long as somebody holds it.
+    /// Registers `spare` to be dropped when memory runs short, for as long as its owner keeps it.
     pub fn give_way(&self, spare: &Arc<impl Spare + 'static>) {
         let spare: Weak<dyn Spare> = Arc::downgrade(&(Arc::clone(spare) as Arc<dyn Spare>));
         let mut spares = self.ledger.spares.lock().unwrap_or_else(PoisonError::into_inner);
@@ -143,7 +144,7 @@ impl Gpu {
         })
     }
 
-    /// A buffer, or the refusal: the limit speaks as wgpu does for the driver.
+    /// A buffer, or the refusal. The limit refuses with the same error as wgpu does for the driver.
     fn try_allocate(&self, descriptor: &wgpu::BufferDescriptor<'_>) -> Result<wgpu::Buffer, wgpu::Error> {
         if self.is_beyond_limit(descriptor.size) {
             return Err(wgpu::Error::OutOfMemory { source: Box::new(BeyondLimit) });
@@ -152,8 +153,8 @@ impl Gpu {
         refusal.map_or(Ok(buffer), Err)
     }
 
-    /// A buffer whatever the limit says; an invalid one where there is a refusal, whose use is an error but
-    /// no panic.
+    /// A buffer, ignoring the limit. After a refusal the buffer is invalid; using it is an error but does not
+    /// panic.
     pub(super) fn create(
         &self,
         descriptor: &wgpu::BufferDescriptor<'_>,
@@ -165,8 +166,8 @@ impl Gpu {
         (buffer, refusal)
     }
 
-    /// Whether `bytes` may be written: waits for earlier writes where too many wait. Where the limit has no
-    /// room for their staging buffer, [`Gpu::check`] will say so.
+    /// Whether `bytes` may be written; waits first if too many staged bytes are pending. If the limit has no
+    /// room for the staging buffer, [`Gpu::check`] reports it.
     pub(super) fn may_stage(&self, bytes: u64) -> bool {
         self.room_to_stage(bytes).map_err(|error| self.faults.report(error)).is_ok()
     }
@@ -191,7 +192,7 @@ impl Gpu {
         Ok(())
     }
 
-    /// Looks at the peak after a write of `bytes`.
+    /// Updates the peak after a write of `bytes`.
     pub(super) fn staged(&self, bytes: u64) {
         if bytes >= SMALLEST_COUNTED_WRITE {
             self.note_peak();
@@ -215,7 +216,7 @@ impl Gpu {
 
     fn out_of_memory(&self, what: &str, bytes: u64, refusal: &wgpu::Error) -> CoreError {
         let allocated = self.allocated();
-        tracing::debug!(labels = ?self.memory_by_label(), "what is allocated on the device");
+        tracing::debug!(labels = ?self.memory_by_label(), "memory allocated on the device");
         let source = std::error::Error::source(refusal);
         let by_limit = source.is_some_and(|source| source.is::<BeyondLimit>());
         let by = if by_limit { "the limit" } else { "the driver" };

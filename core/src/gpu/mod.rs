@@ -1,7 +1,7 @@
 //! The GPU: adapter and device, compute kernels, and rendering of a model.
 //!
-//! Everything is compute shaders of `shaders/`, one kernel a file. Bindings are found by name (reflected with
-//! naga from the WGSL), so a kernel and its call cannot drift apart silently.
+//! Everything is compute shaders of `shaders/`, one kernel per file. Bindings are found by name, reflected
+//! from the WGSL by naga, so a mismatch between a kernel and its call is an error.
 
 mod blocks;
 mod bounds;

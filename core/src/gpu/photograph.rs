@@ -1,4 +1,4 @@
-//! A photograph on the device, with what its rays end on where that is known.
+//! A photograph on the device, with the ray map of its view if there is one.
 
 use super::Gpu;
 use crate::Result;
@@ -11,9 +11,9 @@ pub struct DevicePhotograph {
     pub pixels: wgpu::Buffer,
     /// Columns and rows.
     pub size: [u32; 2],
-    /// Whether any pixel does not count.
+    /// Whether any pixel is masked.
     pub masked: bool,
-    /// What the rays of the view end on, where that is known.
+    /// What the rays of the view hit, if known.
     pub map: Option<DeviceMap>,
 }
 
@@ -29,20 +29,20 @@ pub struct DeviceMap {
 }
 
 impl DevicePhotograph {
-    /// Uploads.
+    /// Uploads a photograph.
     ///
     /// # Errors
     /// When the device cannot hold it.
     pub fn new(gpu: &Gpu, image: &PackedImage) -> Result<Self> {
         let pixels = gpu.streamed("photograph", 4 * image.pixels.len() as u64)?;
         gpu.write(&pixels, 0, &image.pixels);
-        // A write that found no room must not leave a black photograph behind.
+        // A write that failed for lack of memory must not leave a black photograph.
         gpu.check()?;
         let masked = image.pixels.iter().any(|pixel| pixel >> 24 != 255);
         Ok(Self { pixels, size: [image.width, image.height], masked, map: None })
     }
 
-    /// The same with what the rays of the view end on.
+    /// The same with a map of what the rays of the view hit.
     pub(crate) fn with_map(mut self, gpu: &Gpu, map: Option<&RayMap>) -> Result<Self> {
         if let Some(map) = map.filter(|map| !map.cells.is_empty()) {
             let buffer = gpu.streamed("map", 4 * map.cells.len() as u64)?;

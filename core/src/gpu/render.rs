@@ -1,8 +1,8 @@
-//! Rendering of one model from any camera, at any size.
+//! Renders one model from any camera, at any size.
 //!
-//! A picture that the device cannot bind is rendered in strips of rows, each a picture of its own. The
-//! projection is always that of the whole picture, so a strip shows what the whole would show there. Where
-//! the lists of a strip would be too long, it is rendered in bands of tiles, as in training.
+//! An image that the device cannot bind is rendered in strips of rows, each an image of its own. The
+//! projection is always that of the whole image, so a strip shows the same pixels. If the lists of a strip
+//! would be too long, it is rendered in bands of tiles, as in training.
 
 use std::sync::Arc;
 
@@ -18,7 +18,7 @@ use crate::scene::{PinholeCamera, Pose};
 use crate::water::{ByDirection, LEAST_ALPHA, RangeModulation, Water, WaterRecord};
 use crate::{CoreError, Result};
 
-/// A sum of unit normals shorter than this share of its weights points nowhere.
+/// A weighted sum of unit normals shorter than this share of its weights has no direction.
 const NO_DIRECTION: f64 = 1e-3;
 
 /// A rendered view. Arrays are row-major from the top left.
@@ -30,44 +30,43 @@ pub struct Rendered {
     pub height: u32,
     /// Colour over the background, as trained (sRGB for `3dgs`), unclamped.
     pub rgb: Vec<[f32; 3]>,
-    /// 1 - transmittance left.
+    /// 1 - remaining transmittance.
     pub alpha: Vec<f32>,
     /// Sum of weight times distance along the ray, scene units; divide by alpha for the expected range.
     pub range: Vec<f32>,
 }
 
 impl Rendered {
-    /// Expected distance along the ray, scene units, `[H*W]`; 0 where there is nothing.
+    /// Expected distance along the ray, scene units, `[H*W]`; 0 where alpha is 0.
     pub fn expected_range(&self) -> Vec<f32> {
         let of_pixel = |(range, alpha): (&f32, &f32)| if *alpha > 0.0 { range / alpha } else { 0.0 };
         self.range.iter().zip(&self.alpha).map(of_pixel).collect()
     }
 }
 
-/// Which picture of a scene under water is rendered.
+/// Which image of an underwater scene is rendered.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Output {
     /// I: as the camera sees it.
     Underwater,
     /// J: without the water.
     Restored,
-    /// B: the water's own light alone.
+    /// B: the backscatter alone.
     Backscatter,
 }
 
 /// A water to render through.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct WaterView {
-    /// The nine numbers.
+    /// The water parameters.
     pub water: Water,
-    /// How coefficients follow from range, where they do: only where the water acts on pixels.
+    /// How the coefficients depend on range, if they do; only if the water acts on pixels.
     pub refinement: Option<RangeModulation>,
-    /// How the colour of open water changes with direction, where it does: only where the water acts on
-    /// pixels.
+    /// How the colour of open water changes with direction, if it does; only if the water acts on pixels.
     pub by_direction: Option<ByDirection>,
-    /// Where they act, and how Gaussians are blended: as the model was trained.
+    /// Where the water acts and how Gaussians are blended: as the model was trained.
     pub composition: Composition,
-    /// Which picture is rendered.
+    /// Which image is rendered.
     pub output: Output,
 }
 
@@ -79,14 +78,14 @@ impl WaterView {
         Self { water, refinement, by_direction, composition, output }
     }
 
-    /// The same as it is along `direction`, unit length, scene axes.
+    /// The same with the water along `direction` (unit length, scene axes).
     fn along(&self, direction: DVec3) -> Self {
         let water = self.by_direction.map_or(self.water, |colours| colours.along(&self.water, direction));
         Self { water, ..*self }
     }
 
-    /// A pixel in sRGB, from what was blended, its alpha and range, over `background`, sRGB; of a water along
-    /// the ray of the pixel. Twin: `shaders/water.wgsl`.
+    /// A pixel in sRGB from the blended colour, its alpha and range, over `background` (sRGB). `self` is the
+    /// water along the ray of the pixel. Twin: `shaders/water.wgsl`.
     fn pixel(&self, blended: [f32; 3], alpha: f32, range: f32, background: [f32; 3]) -> [f32; 3] {
         let b_inf = self.water.b_inf;
         let alpha = f64::from(alpha);
@@ -111,7 +110,7 @@ impl WaterView {
                 shown if as_shown && !open => alpha * srgb_to_linear((shown / alpha).max(0.0)),
                 light => light,
             };
-            // Of what ends no ray, the water up to the Gaussians alone.
+            // Over black, rays that hit nothing have no backscatter.
             let share = match (over_black, open) {
                 (true, true) => 0.0,
                 (true, false) => alpha,
@@ -134,20 +133,20 @@ impl WaterView {
 pub struct Renderer {
     gpu: Arc<Gpu>,
     blocks: Blocks,
-    /// The same Gaussians with other colours; made when they are asked for.
+    /// The same Gaussians with other colours; made on first use.
     recoloured: Option<Blocks>,
     frame: Frame,
-    /// Which Gaussian of the model lies where on the device.
+    /// Index in the model of each Gaussian on the device.
     order: Vec<u32>,
     options: RenderOptions,
 }
 
-/// How pictures are rendered.
+/// How images are rendered.
 struct RenderOptions {
     strip_tiles: u32,
     mip_filter: bool,
     water: Option<WaterView>,
-    /// In how many bands the strip was rendered that needed most so far.
+    /// Largest number of bands that a strip needed so far.
     bands: u32,
 }
 
@@ -174,15 +173,15 @@ impl Renderer {
         self
     }
 
-    /// Renders through this water, or what is left of the picture without it: for models whose colours are J.
-    /// Pictures are in sRGB as before; where the water is seen, open water takes the place of a background.
+    /// Renders through this water, for models whose colours are J; [`WaterView::output`] selects the image.
+    /// Images remain in sRGB. Where the water is visible, open water replaces the background.
     #[must_use]
     pub fn with_water(mut self, water: Option<WaterView>) -> Self {
         self.set_water(water);
         self
     }
 
-    /// Goes on as [`Renderer::with_water`] says.
+    /// As [`Renderer::with_water`], from now on.
     pub fn set_water(&mut self, water: Option<WaterView>) {
         if let Some(view) = &water {
             self.frame.set_water(&self.gpu, &view.water);
@@ -190,14 +189,14 @@ impl Renderer {
         self.options.water = water;
     }
 
-    /// The same renderer with strips of at most `tiles` tiles, but never less than a row of them: for devices
-    /// with little memory.
+    /// The same renderer with strips of at most `tiles` tiles but at least one row of tiles, for devices with
+    /// little memory.
     pub fn with_strip_tiles(mut self, tiles: u32) -> Self {
         self.options.strip_tiles = self.options.strip_tiles.min(tiles);
         self
     }
 
-    /// Renders with lists no longer than these, in as many bands as it takes: tests.
+    /// Limits the lengths of the lists, which may require more bands; for tests.
     #[must_use]
     pub fn with_list_limits(mut self, limits: ListLimits) -> Self {
         self.frame = self.frame.with_limits(limits);
@@ -207,18 +206,18 @@ impl Renderer {
     /// Renders over `background`.
     ///
     /// # Errors
-    /// When the device fails, or cannot bind what one tile needs.
+    /// When the device fails, or cannot bind the lists of a single tile.
     pub fn render(&mut self, camera: &PinholeCamera, pose: &Pose, background: [f32; 3]) -> Result<Rendered> {
         draw(&self.gpu, &mut self.frame, &self.blocks, &mut self.options, (camera, pose), background)
     }
 
-    /// The normals of `model`, which must be the one that was uploaded: for each pixel the unit direction of
-    /// the blended [`Gaussians::normals_towards`] the camera, `[H*W]`, in the camera's frame (x right, y
-    /// down, z forward); zero where there is nothing, or where normals cancel out.
+    /// The normals of `model`, which must be the uploaded model, `[H*W]`. Each is the unit direction of the
+    /// blended [`Gaussians::normals_towards`] the camera, in camera axes (x right, y down, z forward). Zero
+    /// where alpha is 0 or where normals cancel out.
     ///
     /// # Errors
-    /// As [`Renderer::render`]; also when `model` has another number of Gaussians, or the device cannot hold
-    /// 48 bytes more for each of them.
+    /// As [`Renderer::render`]; also when `model` has a different number of Gaussians, or the device cannot
+    /// hold 48 more bytes per Gaussian.
     pub fn normals(
         &mut self,
         model: &Gaussians,
@@ -227,7 +226,7 @@ impl Renderer {
     ) -> Result<Vec<[f32; 3]>> {
         let normals = model.normals_towards(pose.centre());
         let in_camera = normals.iter().map(|normal| pose.rotation * DVec3::from(normal.map(f64::from)));
-        // Colours are clamped at 0, so what is blended is (n + 1) / 2.
+        // Colours are clamped at 0, so (n + 1) / 2 is blended.
         let colours: Vec<[f32; 3]> = in_camera.map(|n| ((n + 1.0) / 2.0).as_vec3().to_array()).collect();
         let rendered = self.render_coloured(&colours, camera, pose)?;
         let unit = |(rgb, alpha): (&[f32; 3], &f32)| {
@@ -248,7 +247,7 @@ impl Renderer {
     ) -> Result<Rendered> {
         if colours.len() != self.blocks.total() as usize {
             return Err(CoreError::Scene(format!(
-                "{} colours for {} Gaussians: another model was uploaded than is drawn",
+                "{} colours for {} Gaussians: the model differs from the uploaded one",
                 colours.len(),
                 self.blocks.total()
             )));
@@ -261,7 +260,7 @@ impl Renderer {
         for block in blocks.iter() {
             let (indices, after) = rest.split_at(block.count as usize);
             rest = after;
-            // Three vec4 a Gaussian, of which one coefficient is used (`sh_stride`).
+            // Three vec4 per Gaussian (`sh_stride`), of which only the first coefficient is used.
             let rows: Vec<[f32; 12]> = indices
                 .iter()
                 .map(|&index| {
@@ -272,7 +271,7 @@ impl Renderer {
                 .collect();
             self.gpu.write(&block.sh_coeffs, 0, &rows);
         }
-        // These are no colours: nothing is to be done to them.
+        // These are not colours, so the water must not change them.
         let water = self.options.water.take();
         let rendered = draw(&self.gpu, &mut self.frame, &blocks, &mut self.options, (camera, pose), [0.0; 3]);
         self.options.water = water;
@@ -281,7 +280,7 @@ impl Renderer {
     }
 }
 
-/// Renders strip after strip.
+/// Renders strip by strip.
 fn draw(
     gpu: &Gpu,
     frame: &mut Frame,
@@ -310,7 +309,7 @@ fn draw(
     for first in (0..camera.height).step_by(rows as usize) {
         let count = rows.min(camera.height - first);
         // The principal point moves with the strip; the bounds of the projection stay those of the whole
-        // picture.
+        // image.
         let strip = FrameUniform {
             principal: [view.principal[0], (camera.cy - f64::from(first)) as f32],
             ..view.with_size([camera.width, count], tile)
@@ -320,7 +319,7 @@ fn draw(
     if let Some(water) = &options.water {
         let to_world = pose.rotation.inverse();
         for (i, rgb) in picture.rgb.iter_mut().enumerate() {
-            // Directions cost as much as the rest, and most waters are the same in all of them.
+            // The directions cost as much as the rest of the loop, and most waters do not depend on them.
             let here = match water.by_direction {
                 Some(_) => water.along(to_world * camera.direction(i)),
                 None => *water,
@@ -340,8 +339,8 @@ fn draw_strip(
     strip: &FrameUniform,
     picture: &mut Rendered,
 ) -> Result<()> {
-    // A list that was too short says what it needed: it grows as far as the device can bind it, then the
-    // strip is cut.
+    // A list that was too short reports the length it needed. It grows up to the largest binding; then the
+    // strip is cut into bands.
     loop {
         frame.prepare_targets(gpu, strip.size)?;
         for band in strip.bands(*bands, gpu.tile()) {

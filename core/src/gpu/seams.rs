@@ -1,4 +1,5 @@
-//! Measures a model for seams while its views are rendered: renders its surfaces for [`crate::seams`].
+//! Measures the seams of a model while its views are rendered: renders the surfaces that [`crate::seams`]
+//! needs.
 
 use std::sync::Arc;
 
@@ -11,18 +12,18 @@ use crate::seams::{SeamLines, SeamMeter, SeamReport, SeenView};
 use crate::views::PackedImage;
 use crate::{CoreError, Result};
 
-/// The surfaces of a model on the device, and what was measured so far.
+/// The surfaces of a model on the device, and the measurements so far.
 pub struct SeamRun {
     renderer: Renderer,
     meter: SeamMeter,
 }
 
 impl SeamRun {
-    /// Uploads the surfaces of `model`: [`Gaussians::surfaces`] by the usual viewing distance of its plan,
-    /// scene units.
+    /// Uploads the surfaces of `model`: [`Gaussians::surfaces`] with `viewing_distance`, the scene scale of
+    /// its plan, scene units.
     ///
     /// # Errors
-    /// When the device cannot hold them beside what it holds already.
+    /// When the device cannot hold them in addition to what it already holds.
     pub fn new(
         gpu: &Arc<Gpu>,
         model: &Gaussians,
@@ -35,11 +36,11 @@ impl SeamRun {
         Ok(Self { renderer, meter: SeamMeter::new(lines, config) })
     }
 
-    /// The same, but `None`, with a warning, where the device has no room for it: a model that can be
-    /// rendered is measured, with or without its borders.
+    /// As [`SeamRun::new`], but returns `None` and logs a warning if the device has no room. A model that can
+    /// be rendered is thus always evaluated, with or without its borders.
     ///
     /// # Errors
-    /// When the device fails otherwise.
+    /// When the device fails for another reason.
     pub fn if_it_fits(
         gpu: &Arc<Gpu>,
         model: &Gaussians,
@@ -50,15 +51,15 @@ impl SeamRun {
         match Self::new(gpu, model, mip_filter, viewing_distance, measured) {
             Ok(run) => Ok(Some(run)),
             Err(error @ (CoreError::OutOfMemory { .. } | CoreError::BufferTooLarge { .. })) => {
-                tracing::warn!("nothing is measured at the borders of cells: {error}");
+                tracing::warn!("seams at the borders of cells are not measured: {error}");
                 Ok(None)
             }
             Err(error) => Err(error),
         }
     }
 
-    /// Measures one view as [`SeamMeter::add`]; a picture of it, PNG, where it shows enough of a border to
-    /// count.
+    /// Measures one view as in [`SeamMeter::add`]. Returns a picture of it (PNG) if it shows enough of a
+    /// border to count.
     ///
     /// # Errors
     /// When the device fails.
@@ -75,7 +76,7 @@ impl SeamRun {
         zones.counts().then(|| zones.picture(render, truth)).transpose()
     }
 
-    /// Everything that was measured, the views in the order in which they were added.
+    /// All measurements; views are in the order in which they were added.
     pub fn report(self) -> SeamReport {
         self.meter.report()
     }

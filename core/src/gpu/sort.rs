@@ -1,5 +1,5 @@
-//! Prefix sums and stable radix sorts of lists on the device. How long a list is stands in a counter, so that
-//! no number comes back to the host.
+//! Prefix sums and stable radix sorts of lists on the device. The length of a list is in a counter on the
+//! device, so no count is read back to the host.
 
 use super::layout::{SCAN_CHUNK, SORT_BINS, SORT_BITS, SORT_CHUNK};
 use super::{Gpu, Recorder, Size};
@@ -12,7 +12,7 @@ pub struct Scan {
 }
 
 impl Scan {
-    /// For lists of at most `capacity` counts, whose length will stand in counter `slot`.
+    /// For lists of at most `capacity` counts, whose length will be in counter `slot`.
     ///
     /// # Errors
     /// When the device cannot hold the sums.
@@ -28,12 +28,12 @@ impl Scan {
         n.div_ceil(SCAN_CHUNK)
     }
 
-    /// Sums of the chunks; after a scan the sums before each, and the total behind the last.
+    /// Sums of the chunks. After a scan: the sum before each chunk, and the total after the last.
     pub fn sums(&self) -> &wgpu::Buffer {
         &self.sums
     }
 
-    /// Records the sum of `values`; `groups` as [`Scan::groups`] gives them.
+    /// Records the prefix sum of `values`; `groups` as given by [`Scan::groups`].
     ///
     /// # Errors
     /// When a kernel does not compile.
@@ -54,7 +54,7 @@ impl Scan {
 
 /// A stable sort of keys, each with a value.
 pub struct Sort {
-    /// Keys before the sort in the first; see [`Sort::result`].
+    /// The keys to sort go into the first; see [`Sort::result`].
     pub keys: [wgpu::Buffer; 2],
     /// Their values.
     pub values: [wgpu::Buffer; 2],
@@ -64,11 +64,12 @@ pub struct Sort {
 }
 
 impl Sort {
-    /// Bits of the keys that a pass looks at.
+    /// Bits of the keys per pass.
     pub const PASS_BITS: u32 = SORT_BITS;
 
-    /// For lists of at most `capacity` keys of at most `bits` bits. Counter `slot` will hold their number and
-    /// counter `histogram_slot` that of the histogram's entries: [`Sort::histogram_entries`].
+    /// For lists of at most `capacity` keys of at most `bits` bits. Counter `slot` will hold the number of
+    /// keys, and counter `histogram_slot` the number of entries of the histogram
+    /// ([`Sort::histogram_entries`]).
     ///
     /// # Errors
     /// When the device cannot hold them.
@@ -106,13 +107,13 @@ impl Sort {
         self.scratch().map(wgpu::Buffer::size).sum::<u64>() - self.scan.sums.size()
     }
 
-    /// All that it writes.
+    /// All buffers that it writes.
     pub fn scratch(&self) -> impl Iterator<Item = &wgpu::Buffer> {
         self.keys.iter().chain(&self.values).chain([&self.histogram, &self.scan.sums])
     }
 
-    /// Records a sort by the lower `bits` of the keys; `groups` for the keys and for the scan of the
-    /// histogram, as [`Sort::groups`] and [`Scan::groups`] give them.
+    /// Records a sort by the lower `bits` of the keys. `groups` are for the keys and for the scan of the
+    /// histogram, as given by [`Sort::groups`] and [`Scan::groups`].
     ///
     /// # Errors
     /// When a kernel does not compile.

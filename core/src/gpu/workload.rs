@@ -1,29 +1,30 @@
-//! How much blending a view asks for: counts that benchmarks relate times to.
+//! How much blending a view requires: counts that benchmarks relate times to.
 
 use super::layout::counter;
 use super::{Frame, FrameUniform, Gpu};
 use crate::Result;
 
-/// What the last forward pass of a view had to do. An evaluation is one splat at one pixel of a tile that it
+/// Work of the last forward pass of a view. An evaluation is one splat at one pixel of a tile that it
 /// touches.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Workload {
-    /// Gaussians that the view may see.
+    /// Gaussians that may be visible.
     pub visible: u32,
     /// Pairs of a splat and a tile that it touches.
     pub intersections: u32,
     /// Evaluations of every intersection at every pixel of its tile.
     pub listed_evaluations: u64,
-    /// Evaluations up to the last splat that any pixel of a tile needs before its ray ends: no forward can do
-    /// with fewer without looking at pixels apart, and the backward stops there.
+    /// Evaluations up to the last splat that any pixel of a tile needs before its ray ends. Without treating
+    /// pixels separately, no forward pass can do with fewer. The backward pass stops there.
     pub needed_evaluations: u64,
 }
 
 impl Frame {
-    /// Counts what the forward pass of `view` did; waits for it. Of a view in bands, its last band.
+    /// Counts the work of the forward pass of `view`, and waits for it. For a view in bands, counts the last
+    /// band.
     ///
     /// # Errors
-    /// When no targets were made or the device fails.
+    /// When targets are missing or the device fails.
     pub fn workload(&self, gpu: &Gpu, view: &FrameUniform) -> Result<Workload> {
         let counters: Vec<u32> = gpu.read(&self.counters, 0, counter::COUNT as usize)?;
         let targets = self.targets()?;

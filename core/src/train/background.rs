@@ -1,9 +1,9 @@
-//! Gaussians behind everything: open water, sky, what lies beyond the sparse points.
+//! Background Gaussians behind everything: sky, open water and whatever lies beyond the sparse points.
 //!
-//! Where a ray meets no surface, 3DGS has only its background colour, and the run builds what is seen there
-//! from veils between the cameras and the scene. They fit the views that they were made for and stand in the
-//! way of all others. A shell around the scene gives these rays an end that all views agree on (as sky
-//! spheres do in models of streets).
+//! For rays that meet no surface, 3DGS has only its background colour. Training then builds what is seen
+//! there from veils between the cameras and the scene, which fit their own views and obstruct all others. A
+//! shell around the scene gives these rays an end on which all views agree, like the sky spheres in street
+//! models.
 
 use std::f64::consts::PI;
 
@@ -14,21 +14,21 @@ use crate::scene::Points;
 use crate::views::TrainView;
 use crate::water::Water;
 
-/// Radius of the shell, in distances of the farthest camera or point.
+/// Radius of the shell, relative to the distance of the farthest camera or point.
 const RADIUS: f64 = 1.2;
-/// Share of the points that the shell must enclose; the others are taken for outliers.
+/// Share of the points that the shell must enclose; the others are considered outliers.
 const ENCLOSED: f64 = 0.99;
-/// Deviation in distances between neighbours: with [`OPACITY`] no gap shows.
+/// Standard deviation relative to the spacing of neighbours: with [`OPACITY`], no gap is visible.
 const OVERLAP: f64 = 0.7;
-/// Opacity of the shell at first.
+/// Initial opacity of the shell.
 const OPACITY: f32 = 0.99;
 
-/// The part of a shell of `count` Gaussians around `points` and cameras that some view sees, in their mean
-/// colour.
+/// The part of a shell of `count` Gaussians around `points` and cameras that any view sees, in the mean
+/// colour of the points.
 ///
-/// Empty when there are no points to enclose, or all of them lie in one place; and where a water takes more
-/// than half of its light: there the colour of open water ends the rays, and a shell would have a J of any
-/// colour, which shows through every hole of the surface once the water is taken away.
+/// Empty if there are no points to enclose or if all of them lie in one place. Also empty if a water takes
+/// more than half of the light of the shell. The colour of open water then ends the rays. The J of a shell
+/// would be arbitrary, and would show through every hole of the surface once the water is removed.
 pub(super) fn background_gaussians(
     points: &Points,
     views: &[TrainView],
@@ -64,7 +64,7 @@ pub(super) fn background_gaussians(
     shell
 }
 
-/// Distance from `middle` of the farthest camera, or of all points but the farthest ones.
+/// Largest distance from `middle` of a camera, or of a point except the outliers.
 fn reach(points: &Points, centres: &[DVec3], middle: DVec3) -> f64 {
     let mut distances: Vec<f64> =
         points.positions.iter().map(|point| DVec3::from(point.map(f64::from)).distance(middle)).collect();
@@ -81,7 +81,7 @@ fn mean_colour(points: &Points) -> [f32; 3] {
     sums.map(|sum| (sum / points.colours.len().max(1) as f64) as f32)
 }
 
-/// `count` directions, evenly over the sphere (Fibonacci lattice).
+/// `count` directions, evenly distributed over the sphere (Fibonacci lattice).
 fn directions(count: u32) -> impl Iterator<Item = DVec3> {
     let turn = PI * (3.0 - 5.0_f64.sqrt());
     (0..count).map(move |index| {
@@ -91,7 +91,7 @@ fn directions(count: u32) -> impl Iterator<Item = DVec3> {
     })
 }
 
-/// Whether a ball reaches into a picture.
+/// Whether a ball is partly inside the image of a view.
 fn is_in_view(centre: DVec3, radius: f64, view: &TrainView) -> bool {
     let camera = &view.camera;
     let p = view.pose.transform(centre);
@@ -117,7 +117,7 @@ mod tests {
         }
     }
 
-    /// Points on a floor of 20 x 20, one of them far astray, and two views along it.
+    /// Points on a floor of 20 x 20 with one far outlier, and two views along it.
     fn scene() -> (Points, Vec<TrainView>) {
         let mut points = Points::default();
         for (x, z) in (-10..=10).flat_map(|x| (-10..=10).map(move |z| (x, z))) {
@@ -130,7 +130,7 @@ mod tests {
     }
 
     #[test]
-    fn every_ray_of_every_view_ends_on_the_far_field() {
+    fn every_ray_of_every_view_ends_on_the_shell() {
         let (points, views) = scene();
         let shell = background_gaussians(&points, &views, 1, 500, None);
         let deviation = f64::from(shell.log_scales[0][0].exp());
@@ -155,7 +155,7 @@ mod tests {
     }
 
     #[test]
-    fn it_lies_behind_the_points_but_not_behind_outliers() {
+    fn the_shell_lies_behind_the_points_but_not_behind_outliers() {
         let (points, views) = scene();
         let shell = background_gaussians(&points, &views, 0, 200, None);
         for mean in &shell.means {
@@ -165,19 +165,20 @@ mod tests {
     }
 
     #[test]
-    fn under_water_it_is_there_only_where_half_of_its_light_comes_through() {
+    fn under_water_half_of_the_light_of_the_shell_must_arrive() {
         let (points, views) = scene();
         let with = |blue: f64| {
             let water = Water { beta_d: [9.0, 0.5, blue], beta_b: [9.0; 3], b_inf: [0.1; 3] };
             background_gaussians(&points, &views, 0, 200, Some(&water))
         };
-        // The shell is 12 to 18 units away, and half is left after ln 2 / 18 = 0.039 of attenuation a unit.
+        // The shell is 12 to 18 units away; at 18, half is left with an attenuation of ln 2 / 18 = 0.039 per
+        // unit.
         assert_eq!(with(0.02), background_gaussians(&points, &views, 0, 200, None));
         assert!(with(0.06).is_empty());
     }
 
     #[test]
-    fn what_no_view_sees_is_left_out() {
+    fn parts_of_the_shell_that_no_view_sees_are_left_out() {
         let (points, views) = scene();
         let (both, one) = (
             background_gaussians(&points, &views, 0, 500, None),
@@ -189,7 +190,7 @@ mod tests {
     }
 
     #[test]
-    fn it_has_the_mean_colour_and_as_many_coefficients_as_the_degree_asks_for() {
+    fn the_shell_has_the_mean_colour_and_the_configured_degree() {
         let (points, views) = scene();
         let shell = background_gaussians(&points, &views, 2, 100, None);
         assert_eq!(shell.sh_coeffs.len(), 9 * shell.len());
@@ -201,7 +202,7 @@ mod tests {
     }
 
     #[test]
-    fn a_scene_in_one_place_or_without_points_has_none() {
+    fn a_scene_in_one_place_or_without_points_has_no_shell() {
         let (points, views) = scene();
         assert!(background_gaussians(&points, &views, 0, 0, None).is_empty());
         assert!(background_gaussians(&Points::default(), &views, 0, 100, None).is_empty());

@@ -1,18 +1,18 @@
-//! The backward pass of a view and the step, in one piece or band by band.
+//! The backward pass of a view and the optimiser step, in one piece or band by band.
 
 use crate::Result;
 use crate::appearance::chain::{Appearance, SplatGradients};
 use crate::config::Moments;
 use crate::gpu::{Block, BlockTraining, Blocks, Frame, FrameUniform, Gpu, Recorder, Size, counter};
 
-/// What the backward pass reads and writes besides the frame and the blocks.
+/// Buffers of the backward pass besides those of the frame and the blocks.
 #[derive(Clone, Copy)]
 pub struct BackwardBuffers<'a> {
-    /// `[H*W]` vec4: gradient of the loss by rgb and alpha of the render.
+    /// `[H*W]` vec4: gradient of the loss with respect to rgb and alpha of the render.
     pub v_image: &'a wgpu::Buffer,
-    /// `[H*W]`: gradient of the loss by the range image.
+    /// `[H*W]`: gradient of the loss with respect to the range image.
     pub v_range: &'a wgpu::Buffer,
-    /// `[intersections*3]` vec4: gradients of the splats by tile.
+    /// `[intersections*3]` vec4: gradients of the splats in each tile.
     pub slot_gradients: &'a wgpu::Buffer,
     /// `StepUniform`.
     pub step: &'a wgpu::Buffer,
@@ -20,7 +20,7 @@ pub struct BackwardBuffers<'a> {
     pub appearances: &'a [&'a dyn Appearance],
 }
 
-/// Records the backward pass of a view that [`Frame::record_forward`] rendered whole, and the step.
+/// Records the backward pass and the step of a view that [`Frame::record_forward`] rendered whole.
 ///
 /// # Errors
 /// When a kernel does not compile or the frame has no targets.
@@ -53,11 +53,12 @@ pub fn record_backward(
     buffers.appearances.iter().try_for_each(|appearance| appearance.record_step(recorder, frame))
 }
 
-/// Records the backward pass of a view that was rendered in these bands, and the step. Gives the same bytes
-/// as one band.
+/// Records the backward pass and the step of a view that was rendered in these bands. Gives the same bytes as
+/// a single band.
 ///
-/// Lists are made once more for each band, its gradients added to those of the bands before, by Gaussian; the
-/// step follows when all are there. Each band is a submission, since its uniform is one.
+/// For each band the lists are rebuilt and its gradients are added to those of the earlier bands, per
+/// Gaussian. The step follows after the last band. Each band is a submission, because all bands use one
+/// uniform buffer.
 ///
 /// # Errors
 /// When a kernel does not compile, the frame has no targets, or the device cannot hold the sums.

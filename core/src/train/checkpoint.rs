@@ -1,10 +1,15 @@
-//! Checkpoints: everything that a resumed run needs to give the bytes of an uninterrupted one.
+//! Checkpoints: everything that a resumed run needs to give the same bytes as an uninterrupted one.
 //!
-//! Layout, little-endian: magic, format, digest of the run, iteration, Gaussians at the start, Gaussians in
-//! focus, then for each trainable block its arrays up to its count, then the arrays of the appearances, from
-//! the loss back to the Gaussians, then the network of the water after the number of its bytes, where the run
-//! has one, then BLAKE3 of all before. Random numbers are functions of (seed, iteration), schedules of the
-//! iteration, so neither has a state to keep.
+//! Layout, little-endian:
+//!
+//! 1. magic, format, digest of the run, iteration, Gaussians at the start, Gaussians in focus
+//! 2. for each trainable block its arrays, up to its count
+//! 3. the arrays of the appearances, from the loss back to the Gaussians
+//! 4. if the run has a network of the water: the number of its bytes, then the network
+//! 5. BLAKE3 of all of the above
+//!
+//! Random numbers are functions of (seed, iteration) and schedules are functions of the iteration, so neither
+//! has stored state.
 
 use super::{TrainRun, Trainer};
 use crate::gaussians::Gaussians;
@@ -15,11 +20,10 @@ const MAGIC: &[u8; 8] = b"fathomck";
 const FORMAT: u32 = 4;
 const HEADER: usize = 8 + 4 + 32 + 3 * 4;
 
-/// BLAKE3 of configuration, extent, views, focus, context and surfaces.
+/// BLAKE3 of configuration, extent, water, views, focus, context and surfaces.
 pub(super) fn run_digest(run: &TrainRun) -> [u8; 32] {
     let mut hasher = blake3::Hasher::new();
-    // How often checkpoints are made, who reads photographs and when metrics are taken does not change what
-    // is trained.
+    // The result does not depend on the checkpoint interval, the prefetch threads or the evaluation interval.
     let config = crate::config::TrainConfig {
         checkpoint_seconds: 0,
         prefetch_threads: 0,
@@ -79,19 +83,19 @@ pub(super) fn save(trainer: &mut Trainer) -> Result<Vec<u8>> {
     Ok(bytes)
 }
 
-/// What a run has besides its Gaussians: buffers with the bytes that count.
+/// The state of a run besides its Gaussians: buffers with the number of bytes in use.
 fn extras(trainer: &Trainer) -> impl Iterator<Item = (&wgpu::Buffer, usize)> {
     trainer.appearances.arrays(&trainer.frame)
 }
 
 impl Trainer {
-    /// The bytes of what a run has besides its Gaussians, but for the network of the water.
+    /// The bytes of the state besides the Gaussians, without the network of the water.
     pub(super) fn extras(&self) -> Result<Vec<Vec<u8>>> {
         extras(self).map(|(buffer, length)| self.gpu.read::<u8>(buffer, 0, length)).collect()
     }
 
-    /// Takes what [`Trainer::extras`] gave of a run on the same views with the same configuration, and the
-    /// state of its network.
+    /// Restores the state from [`Trainer::extras`] of a run on the same views with the same configuration,
+    /// and the state of its network.
     pub(super) fn take_extras(&mut self, bytes: &[Vec<u8>], network: Option<&[u8]>) -> Result<()> {
         for ((buffer, _), bytes) in extras(self).zip(bytes) {
             self.gpu.write(buffer, 0, bytes);
@@ -100,7 +104,7 @@ impl Trainer {
     }
 }
 
-/// Gives the run the state of the network of its water, where it has one.
+/// Restores the network of the water, if the run has one.
 fn take_network(trainer: &mut Trainer, state: Option<&[u8]>) -> Result<()> {
     if let (Some(predictor), Some(state)) = (&mut trainer.predictor, state) {
         predictor.restore(state)?;
@@ -111,11 +115,11 @@ fn take_network(trainer: &mut Trainer, state: Option<&[u8]>) -> Result<()> {
     Ok(())
 }
 
-/// Puts the run where `bytes` stand; it stays where it is when they are refused.
+/// Moves the run to the checkpoint `bytes`. If they are refused, the run stays where it is.
 pub(super) fn restore(trainer: &mut Trainer, bytes: &[u8]) -> Result<()> {
     let refuse = |why: &str| Err(CoreError::Checkpoint(why.to_owned()));
     if bytes.len() < HEADER + 32 || &bytes[..8] != MAGIC {
-        return refuse("this is no checkpoint, or it is torn");
+        return refuse("this is not a checkpoint, or it is torn");
     }
     let (content, digest) = bytes.split_at(bytes.len() - 32);
     if blake3::hash(content).as_bytes() != digest {
@@ -124,7 +128,7 @@ pub(super) fn restore(trainer: &mut Trainer, bytes: &[u8]) -> Result<()> {
     let word =
         |at: usize| u32::from_le_bytes([content[at], content[at + 1], content[at + 2], content[at + 3]]);
     if word(8) != FORMAT {
-        return refuse(&format!("its format is {} and this program reads {FORMAT}", word(8)));
+        return refuse(&format!("its format is {}, but this program reads {FORMAT}", word(8)));
     }
     if content[12..44] != trainer.run_digest {
         return refuse("it belongs to another run: configuration, views or starting model differ");
@@ -141,7 +145,7 @@ pub(super) fn restore(trainer: &mut Trainer, bytes: &[u8]) -> Result<()> {
     trainer.gpu.wait()
 }
 
-/// Takes all that a checkpoint of `count` Gaussians holds, once it is known to hold neither more nor less.
+/// Reads a checkpoint of `count` Gaussians, after checking that it is neither longer nor shorter than needed.
 fn fill(trainer: &mut Trainer, count: u32, mut rest: &[u8]) -> Result<()> {
     let refused = |why: &str| CoreError::Checkpoint(why.to_owned());
     if trainer.blocks.trainable_total() != count {

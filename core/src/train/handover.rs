@@ -1,10 +1,11 @@
-//! A run that goes on as another one on the way. Up to a checkpoint it trains under its own water and beside
-//! the coarse model. Then the water stays as all partitions agreed (`water.partitions = joint`), or the run
-//! goes on beside what its neighbours have trained (`partition.neighbours_from`), or both.
+//! Hands a run over to another run at a checkpoint. Up to the checkpoint it trains with its own water and
+//! next to the coarse model. Then the water is fixed to the one that all partitions agreed on
+//! (`water.partitions = joint`), or the context becomes what the neighbours have trained
+//! (`partition.neighbours_from`), or both.
 //!
-//! Such a run is one of its own. It is decided by the run before, by the checkpoint at which it changes and
-//! by what it goes on with; the digest of its checkpoints is of these. Everything else goes on as it was:
-//! Gaussians that stay, moments, iteration, and with the iteration every schedule.
+//! The result is a run of its own. It is determined by the first run, the checkpoint and what it continues
+//! with, and the digest of its checkpoints covers all of these. Everything else continues: the kept
+//! Gaussians, moments, the iteration and all schedules.
 
 use std::sync::Arc;
 
@@ -15,24 +16,24 @@ use crate::config::TrainConfig;
 use crate::gaussians::Gaussians;
 use crate::gpu::{Block, Gpu, sh_stride};
 
-/// What a run goes on beside: which Gaussians stay its own, and what takes the place of all that it only
-/// rendered.
+/// The surroundings that a run continues with: which Gaussians it still trains, and what replaces its
+/// context.
 pub struct Beside<'a> {
-    /// Whether a Gaussian with this mean (world axes) is still trained; the others are gone.
+    /// Whether a Gaussian with this mean (world axes) is still trained; the others are dropped.
     pub keeps: &'a dyn Fn([f32; 3]) -> bool,
-    /// Gaussians that are rendered and never change from here on.
+    /// Frozen Gaussians: rendered, but not changed from here on.
     pub context: Gaussians,
 }
 
 impl Trainer {
-    /// The run from `state`, a checkpoint of `run`, on with the water `medium` and on `beside` something
-    /// else, where there are such; `None` where it would have nothing left to train. The bytes are those of
-    /// `run` without the exchange where nothing changes: the water is the one that the run has by then and
-    /// moves no more in either, and what is rendered besides is the same.
+    /// Continues the run from `state`, a checkpoint of `run`, with the water `medium` and the surroundings
+    /// `beside`, if given. `None` if nothing would be left to train.
+    /// If nothing changes, the bytes equal those of the uninterrupted `run`. Nothing changes if `medium` is
+    /// the water that the run has by then, fixed in both, and the context is the same.
     ///
     /// # Errors
     /// [`crate::CoreError::Checkpoint`] when `state` is torn or belongs to another run;
-    /// [`crate::CoreError::Config`] when there is a `medium` and `run` has no water.
+    /// [`crate::CoreError::Config`] when a `medium` is given but `run` has no water.
     pub fn hand_over(
         gpu: Arc<Gpu>,
         run: TrainRun,
@@ -60,9 +61,9 @@ impl Trainer {
         Ok(Some(trainer))
     }
 
-    /// A run with the Gaussians of `state` that stay and another context, where the run of `state` stands.
-    /// Its cap is the share of the old one that stays, so that where Gaussians are gone no more come than
-    /// there would have been.
+    /// A run with the kept Gaussians of `state` and another context, at the iteration of `state`. Its cap
+    /// shrinks in proportion to the kept Gaussians, so that it does not grow more than it would have
+    /// otherwise.
     fn go_on_beside(
         gpu: Arc<Gpu>,
         run: TrainRun,
@@ -71,7 +72,7 @@ impl Trainer {
     ) -> Result<Option<Self>> {
         let TrainRun { config, extent, views, surfaces, medium, .. } = &run;
         let (config, extent, views) = (config.clone(), *extent, Arc::clone(views));
-        // What is bare elsewhere is not this run's to cover.
+        // This run does not cover bare surfaces elsewhere.
         let (surfaces, medium) = (surfaces.split_by(keeps).0, medium.clone());
         let mut before = Self::resume(Arc::clone(&gpu), run, state)?;
         let model = before.blocks.download(&gpu)?;
@@ -85,7 +86,7 @@ impl Trainer {
         let extras = before.extras()?;
         let network = before.predictor.as_mut().map(|predictor| predictor.save()).transpose()?;
         let (iteration, initial, most) = (before.iteration, before.initial, before.config.max_gaussians);
-        // Two runs would not fit where one does.
+        // Two runs may not fit in memory at once.
         drop(before);
         let mut chosen = kept.iter().peekable();
         let (focus, _) = model.split_where(|index| chosen.next_if(|row| **row == index).is_some());
@@ -99,7 +100,7 @@ impl Trainer {
         Ok(Some(trainer))
     }
 
-    /// What the run keeps of the Gaussians of the given places, which ascend: each array over all of them.
+    /// The state of the Gaussians at the given places (ascending), one byte vector per array.
     fn rows(&self, places: &[usize]) -> Result<Vec<Vec<u8>>> {
         let mut all: Vec<Vec<u8>> = Vec::new();
         let (mut first, mut left) = (0, places);
@@ -118,7 +119,7 @@ impl Trainer {
         Ok(all)
     }
 
-    /// Puts in what [`Trainer::rows`] gave, for as many Gaussians as there are.
+    /// Writes the state from [`Trainer::rows`] into all trainable Gaussians.
     fn take_rows(&self, rows: &[Vec<u8>]) {
         let mut first = 0;
         for (_, block, _) in self.blocks.trainable() {
@@ -134,11 +135,11 @@ impl Trainer {
         block.arrays(sh_stride(self.config.sh_degree))
     }
 
-    /// Puts the run where `checkpoint`, one of the same run, stands.
+    /// Moves the run to `checkpoint`, which must be one of the same run.
     ///
     /// # Errors
-    /// [`crate::CoreError::Checkpoint`] when it is torn or belongs to another run; the run is then where it
-    /// was.
+    /// [`crate::CoreError::Checkpoint`] when it is torn or belongs to another run; the run then stays where
+    /// it was.
     pub fn go_to(&mut self, checkpoint: &[u8]) -> Result<()> {
         checkpoint::restore(self, checkpoint)
     }
@@ -162,12 +163,12 @@ impl Trainer {
         self.gpu.wait()
     }
 
-    /// What stands behind each of the nine numbers, in the order of eq. 8, after what they have moved so far:
-    /// the sum of the squares of the gradients of its unconstrained number, as Adam's second moment has it. 0
-    /// for one that has not moved. `None` where the run has no water.
+    /// The evidence for each of the water parameters, in the order of eq. 8: the sum of the squared gradients
+    /// of its unconstrained value so far, from Adam's second moment. 0 for a parameter that has not moved.
+    /// `None` if the run has no water.
     ///
-    /// Gradients are those of a mean over the pixels of a picture. So this compares runs with pictures of one
-    /// size.
+    /// Gradients are those of a mean over the pixels of an image, so only runs with equal image sizes can be
+    /// compared.
     ///
     /// # Errors
     /// When the device fails.

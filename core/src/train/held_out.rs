@@ -1,7 +1,7 @@
-//! Metrics on held-out views while a run goes on.
+//! Metrics on held-out views during training.
 //!
-//! The protocol of the final evaluation: renders over black without an exposure, clamped and rounded to 8
-//! bits in sRGB. Nothing that is trained depends on it.
+//! The protocol is that of the final evaluation: renders over black without an exposure, clamped and rounded
+//! to 8 bits in sRGB. Training does not depend on these metrics.
 
 use std::sync::Arc;
 
@@ -16,8 +16,8 @@ use crate::views::ViewSource;
 pub struct HeldOutMetrics {
     /// Iterations done.
     pub iteration: u32,
-    /// Mean of the views' PSNR, dB; views that have none (equal, or masked as a whole) are left out. NaN when
-    /// all are.
+    /// Mean PSNR over the views, dB. Views without one (identical, or fully masked) are left out; NaN if none
+    /// is left.
     pub psnr_db: f64,
     /// Mean SSIM.
     pub ssim: f64,
@@ -26,11 +26,11 @@ pub struct HeldOutMetrics {
 }
 
 impl Trainer {
-    /// Renders the Gaussians in focus as they are now from `held_out` views and compares. `None` when there
-    /// are no views, or when `go_on`, which is asked before each view, says no.
+    /// Renders the current Gaussians in focus from the `held_out` views and compares. `None` if there are no
+    /// views, or if `go_on`, which is called before each view, returns false.
     ///
     /// # Errors
-    /// When a photograph cannot be read, or the device cannot hold the model once more.
+    /// When a photograph cannot be read, or the device cannot hold a second copy of the model.
     pub fn measure(
         &mut self,
         held_out: &dyn ViewSource,

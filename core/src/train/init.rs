@@ -1,4 +1,4 @@
-//! Gaussians to start from.
+//! Initial Gaussians.
 
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
 
@@ -11,18 +11,19 @@ use crate::scene::Points;
 use crate::views::TrainView;
 use crate::{CoreError, Result};
 
-/// Opacity of a new Gaussian (3DGS-MCMC). At 0.1, the value of 3DGS, and with the few steps that a Gaussian
-/// of a large scene gets, what is trained stays a fog: half of sesa-wreck's Gaussians ended below 0.03.
+/// Opacity of a new Gaussian (3DGS-MCMC). 3DGS uses 0.1. With that, and the few steps that a Gaussian of a
+/// large scene gets, the trained model stays a fog: half of sesa-wreck's Gaussians ended below 0.03.
 const OPACITY: f32 = 0.5;
 /// The same for classic density control (3DGS).
 const OPACITY_CLASSIC: f32 = 0.1;
 
-/// The far field takes at most one in so many of the cap: a small model needs its Gaussians for what is near.
+/// The background Gaussians take at most one in this many of the cap: a small model needs its Gaussians for
+/// what is near.
 const FAR_SHARE: u32 = 50;
 
-/// What a run without a coarse model begins with: Gaussians at the sparse points, as many as the cap leaves
-/// room for, and around them the far field ([`TrainConfig::background_gaussians`]), unless the water of
-/// `medium` hides it, or photographs show that open water is there.
+/// Initial Gaussians of a run without a coarse model: Gaussians at the sparse points, as many as the cap
+/// leaves room for. Around them lies a shell of background Gaussians ([`TrainConfig::background_gaussians`]),
+/// unless the water of `medium` hides it, or photographs show open water there.
 ///
 /// # Errors
 /// When there are no points.
@@ -47,12 +48,12 @@ pub fn initial_gaussians(
     Ok(model)
 }
 
-/// Gaussians at sparse points: scale from the three nearest neighbours, colour as SH 0 (3DGS).
+/// Gaussians at sparse points: scale from the three nearest neighbours, colour in SH degree 0 (3DGS).
 pub(super) fn gaussians_from_points(points: &Points, opacity: f32, sh_degree: u8) -> Result<Gaussians> {
     let n = points.positions.len();
     if n == 0 {
         return Err(CoreError::Scene(
-            "the scene has no sparse points to start from; run the structure-from-motion again with points"
+            "the scene has no sparse points to start from; repeat the structure-from-motion and export its points"
                 .into(),
         ));
     }
@@ -71,7 +72,7 @@ pub(super) fn gaussians_from_points(points: &Points, opacity: f32, sh_degree: u8
     Ok(model)
 }
 
-/// Sparse points by where they are.
+/// A search tree of sparse points.
 pub(super) fn searchable(positions: &[[f32; 3]]) -> Result<ImmutableKdTree<f32, 3>> {
     ImmutableKdTree::new_from_slice(positions)
         .map_err(|error| CoreError::Scene(format!("the sparse points cannot be searched: {error}")))
@@ -94,7 +95,7 @@ fn spacing(positions: &[[f32; 3]]) -> Result<Vec<f32>> {
         .collect())
 }
 
-/// At most `cap` of them: a random subset that depends on the seed alone, in the order given.
+/// At most `cap` Gaussians: a random subset that depends only on the seed, in the given order.
 pub(super) fn limit(model: Gaussians, cap: u32, seed: u32) -> Gaussians {
     let n = model.len();
     if n <= cap as usize {
@@ -103,7 +104,7 @@ pub(super) fn limit(model: Gaussians, cap: u32, seed: u32) -> Gaussians {
     tracing::warn!(
         have = n,
         cap,
-        "more Gaussians to start from than the cap allows; a random subset is taken"
+        "there are more initial Gaussians than the cap allows; a random subset is used"
     );
     let mut keep = vec![false; n];
     for index in &permutation(seed, Stream::Densify, u32::MAX, n)[..cap as usize] {
@@ -123,7 +124,7 @@ mod tests {
     use super::*;
     use crate::scene::{PinholeCamera, Pose};
 
-    /// A wall of `side` x `side` points and a camera before it.
+    /// A wall of `side` x `side` points and a camera in front of it.
     fn wall(side: i32) -> (Points, [TrainView; 1]) {
         let positions: Vec<[f32; 3]> =
             (0..side * side).map(|i| [(i % side) as f32, (i / side) as f32, 0.0]).collect();
@@ -134,13 +135,13 @@ mod tests {
     }
 
     #[test]
-    fn the_cap_holds_for_points_and_far_field_together_and_leaves_the_far_field_whole() {
+    fn the_cap_includes_the_background_and_leaves_it_whole() {
         let (points, views) = wall(40);
         for cap in [16, 500, 1000, 1600, 5000] {
             let config = TrainConfig { max_gaussians: cap, sh_degree: 1, ..TrainConfig::default() };
             let model = initial_gaussians(&points, &views, &config, None).unwrap();
             let far = background_gaussians(&points, &views, 1, cap / FAR_SHARE, None);
-            assert!(!far.is_empty() || cap < 100, "a cap of {cap} has no far field");
+            assert!(!far.is_empty() || cap < 100, "a cap of {cap} has no background");
             assert_eq!(model.len(), (cap as usize).min(1600 + far.len()), "at a cap of {cap}");
             assert!(model.means.ends_with(&far.means));
             assert_eq!(model.sh_coeffs.len(), 4 * model.len());
@@ -148,7 +149,7 @@ mod tests {
     }
 
     #[test]
-    fn the_far_field_can_be_left_out_and_has_no_more_than_was_asked_for() {
+    fn the_background_is_optional_and_no_larger_than_configured() {
         let (points, views) = wall(20);
         let config = |background_gaussians| TrainConfig {
             background_gaussians,
@@ -162,9 +163,9 @@ mod tests {
     }
 
     #[test]
-    fn a_gaussian_at_a_point_is_as_wide_as_its_neighbours_are_far() {
+    fn a_gaussian_at_a_point_is_as_wide_as_the_point_spacing() {
         let model = gaussians_from_points(&wall(5).0, 0.5, 0).unwrap();
-        // In the middle three of the four nearest are at a distance of 1.
+        // In the middle, the three nearest points are at a distance of 1.
         assert_eq!(model.log_scales[12], [0.0; 3]);
         let corner = (4.0_f32 / 3.0).sqrt().ln();
         assert!((model.log_scales[0][0] - corner).abs() < 1e-6, "1, 1 and the diagonal");

@@ -1,4 +1,4 @@
-//! One iteration of a run: what is recorded, and what happens when a list was too short.
+//! One iteration of a run: its recording, and the recovery when a list was too short.
 
 use std::sync::Arc;
 
@@ -9,7 +9,7 @@ use crate::appearance::chain::{Gradients, Iteration};
 use crate::gpu::{DevicePhotograph, FrameUniform, KernelTime, Recorder, StepUniform, Workload};
 
 impl Trainer {
-    /// Runs to iteration `end`, growing lists on the way.
+    /// Runs up to iteration `end` and grows lists when needed.
     pub(super) fn run_batch(&mut self, end: u32) -> Result<()> {
         let first = self.iteration;
         while self.iteration < end {
@@ -31,23 +31,23 @@ impl Trainer {
         Ok(())
     }
 
-    /// Says how far the device is where iteration `next` cannot be recorded: those before it are with the
-    /// device already, and must not be done twice by who goes on.
+    /// Sets the progress of the device when iteration `next` cannot be recorded. Earlier iterations are
+    /// already submitted and must not run twice when training continues.
     fn settle(&mut self, next: u32) {
-        // A device that cannot say what it did has failed for good.
+        // A device whose counters cannot be read has failed permanently.
         if let Ok(overflow) = self.frame.overflow(&self.gpu) {
             self.iteration = overflow.map_or(next, |overflow| overflow.failed_at);
         }
     }
 
-    /// The view of an iteration: its index among the views and how often its picture is halved.
+    /// The view of an iteration: its index among the views and how often its image is halved.
     pub(super) fn view_of(&mut self, iteration: u32) -> Key {
         let index = self.targets.view_at(iteration);
         let progress = self.schedule.progress(iteration);
         (index, self.schedule.level(progress, &self.targets.views()[index].camera))
     }
 
-    /// A uniform of the size of what [`Trainer::view_of`] gives.
+    /// A uniform with the image size of a view from [`Trainer::view_of`].
     pub(super) fn picture_of(&self, (index, level): Key) -> FrameUniform {
         let camera = &self.targets.views()[index].camera;
         let size = [camera.width, camera.height].map(|side| (side >> level).max(1));
@@ -93,7 +93,7 @@ impl Trainer {
         if is_predicted {
             recorder.flush();
             if self.frame.overflow(&gpu)?.is_some() {
-                // There is no view, and the device does nothing more until the lists are longer.
+                // The view was not rendered, and the device does nothing until the lists are longer.
                 return Ok(());
             }
             at_once = self.predict_at_once(&gpu, photograph.size)?;
@@ -117,7 +117,7 @@ impl Trainer {
         record_backward_in_bands(&gpu, recorder, &self.frame, &self.blocks, &frame, &bands, buffers)
     }
 
-    /// An iteration as appearances see it.
+    /// The inputs of appearances in one iteration.
     fn seen_in<'a>(
         &'a self,
         number: u32,
@@ -139,7 +139,8 @@ impl Trainer {
         }
     }
 
-    /// Records what is between the blended picture and its gradient: appearances, loss, appearances backward.
+    /// Records the stages between the blended image and its gradient: appearances, loss, appearances
+    /// backward.
     fn record_loss(&self, recorder: &mut Recorder<'_>, now: &Iteration<'_>) -> Result<()> {
         let pictures = self.appearances.record(recorder, now, &self.frame.targets()?.image)?;
         let weight = self.config.ssim_weight;
@@ -152,8 +153,8 @@ impl Trainer {
         self.appearances.record_backward(recorder, now, &pictures, gradients)
     }
 
-    /// Does one iteration as [`Trainer::advance`] does, also after the last, and gives the device time of
-    /// each stage.
+    /// Runs one iteration as [`Trainer::advance`] does, even after the last, and returns the device time of
+    /// each kernel.
     ///
     /// # Errors
     /// When a photograph cannot be read or the device fails.
@@ -181,11 +182,11 @@ impl Trainer {
         }
     }
 
-    /// What the forward pass of the iteration before this one had to do; of a view in bands, its last band.
-    /// Waits for the device: for benchmarks.
+    /// Work of the forward pass of the previous iteration; for a view in bands, of its last band. Waits for
+    /// the device; for benchmarks.
     ///
     /// # Errors
-    /// When no iteration was done yet or the device fails.
+    /// When no iteration has run yet or the device fails.
     pub fn last_workload(&mut self) -> Result<Workload> {
         let key = self.view_of(self.iteration.saturating_sub(1));
         let whole = self.picture_of(key);

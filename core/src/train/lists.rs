@@ -1,8 +1,8 @@
-//! Lists of visible Gaussians and of intersections, which grow when one was too short, and views that are
-//! rendered in bands of tiles where they cannot grow.
+//! Lists of visible Gaussians and of intersections. A list that was too short grows; if it cannot grow, the
+//! view is rendered in bands of tiles.
 //!
-//! What must always hold: no step depends on their lengths, since the device does nothing after the iteration
-//! that failed.
+//! Invariant: no step depends on the lengths of the lists, because the device does nothing after the
+//! iteration that failed.
 
 use glam::DVec3;
 
@@ -15,15 +15,14 @@ use crate::memory::{self, RunSize};
 use crate::views::TrainView;
 
 impl Trainer {
-    /// Goes back to the iteration that failed, with room for its view.
+    /// Returns to the iteration that failed, with room for its view.
     pub(super) fn grow(&mut self, overflow: Overflow) -> Result<()> {
         let key = self.view_of(overflow.failed_at);
         self.iteration = overflow.failed_at;
         self.make_room(key, overflow)
     }
 
-    /// Makes room for a view that failed: longer lists, or more bands where the device cannot bind longer
-    /// ones.
+    /// Makes room for a view that failed: longer lists, or more bands if the device cannot bind longer ones.
     pub(super) fn make_room(&mut self, key: (usize, u32), overflow: Overflow) -> Result<()> {
         tracing::debug!(?overflow, "a list was too short; growing it");
         if !overflow.fits(self.frame.limits()) {
@@ -40,13 +39,14 @@ impl Trainer {
         self.set_list_capacities(visible, intersections)
     }
 
-    /// Goes on with lists of these lengths: they grow when they are too short, and no step depends on them.
+    /// Replaces the lists by lists of these lengths. They still grow when too short, and no step depends on
+    /// their lengths.
     ///
     /// # Errors
     /// When the device cannot bind them.
     pub fn set_list_capacities(&mut self, visible: u32, intersections: u32) -> Result<()> {
-        // The old ones go first: both together would be the most memory that the run ever takes. The shortest
-        // lists meanwhile, so that the trainer stays sound when there is no room for the new ones.
+        // The old lists are freed first: both together would be the peak memory of the run. In between, the
+        // lists have length 1, so that the trainer stays valid if there is no room for the new ones.
         for (visible, intersections) in [(1, 1), (visible, intersections)] {
             self.frame.replace_lists(&self.gpu, visible, intersections)?;
             self.slot_gradients = slot_gradients(&self.gpu, &self.frame)?;
@@ -55,8 +55,8 @@ impl Trainer {
         Ok(())
     }
 
-    /// Goes on with lists that never grow beyond these lengths, nor beyond what the device can bind: views
-    /// that need more are rendered in bands of tiles. No step depends on it.
+    /// Limits the growth of the lists to these lengths and to what the device can bind. Views that need more
+    /// are rendered in bands of tiles. No step depends on the limits.
     ///
     /// # Errors
     /// When the device cannot hold them.
@@ -71,18 +71,18 @@ impl Trainer {
         self.set_list_capacities(visible.min(limits.visible), intersections.min(limits.intersections))
     }
 
-    /// In how many bands the view that needs most of them is rendered by now.
+    /// Largest number of bands of any view so far.
     pub fn most_bands(&self) -> u32 {
         self.bands.values().copied().max().unwrap_or(1)
     }
 
-    /// How many visible Gaussians and intersections the lists hold by now.
+    /// Current capacities of the lists: visible Gaussians and intersections.
     pub fn list_capacities(&self) -> (u32, u32) {
         self.frame.capacities()
     }
 }
 
-/// The lists that a run begins with.
+/// The initial lists of a run.
 pub(super) fn lists(
     gpu: &Gpu,
     config: &TrainConfig,
@@ -118,7 +118,7 @@ pub(super) fn lists(
     run.lists()
 }
 
-/// Room for a gradient of each intersection.
+/// A buffer with a gradient slot for each intersection.
 pub(super) fn slot_gradients(gpu: &Gpu, frame: &Frame) -> Result<wgpu::Buffer> {
     gpu.buffer("slot gradients", u64::from(frame.capacities().1) * memory::GRADIENT_BYTES)
 }

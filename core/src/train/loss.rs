@@ -1,4 +1,5 @@
-//! The loss on the device: (1-w) L1 + w (1 - SSIM), its gradient by the render, and a log of its values.
+//! The loss on the device: (1-w) L1 + w (1 - SSIM), its gradient with respect to the render, and a log of its
+//! values.
 
 use std::ops::Range;
 
@@ -6,10 +7,10 @@ use crate::Result;
 use crate::config::LossLight;
 use crate::gpu::{DevicePhotograph, Gpu, LossUniform, Recorder, Size};
 
-/// Entries of the log; more than the iterations between two looks.
+/// Entries of the log; more than the iterations between two reads.
 const LOG: u32 = 64;
 
-/// Buffers of the loss, for pictures up to a size.
+/// Buffers of the loss, for images up to a size.
 pub struct Loss {
     uniforms: [wgpu::Buffer; 3],
     losses: wgpu::Buffer,
@@ -30,7 +31,7 @@ struct Sized {
 }
 
 impl Loss {
-    /// Without room for any picture yet.
+    /// A loss without buffers for images yet.
     ///
     /// # Errors
     /// When the device fails.
@@ -45,7 +46,7 @@ impl Loss {
         })
     }
 
-    /// The same, comparing in this light: in linear light photographs are decoded, and renders are taken for
+    /// The same, compared in this light. In linear light, photographs are decoded and renders are taken as
     /// linear.
     #[must_use]
     pub fn in_light(self, light: LossLight) -> Self {
@@ -58,7 +59,7 @@ impl Loss {
         Self { factor, ..self }
     }
 
-    /// Makes room for pictures of `size`.
+    /// Makes buffers for images of `size`.
     ///
     /// # Errors
     /// When the device cannot hold them.
@@ -73,7 +74,7 @@ impl Loss {
             moments: gpu.buffer("SSIM moments", pixels * 16)?,
             partials: gpu.buffer("SSIM partials", pixels * 16)?,
             smoothed: gpu.buffer("SSIM smoothed", pixels * 16)?,
-            // A group sums 32 runs of one to eight pixels of a column: at most this many, whatever the shape.
+            // A group sums 32 runs of one to eight pixels of a column, so this is enough for any shape.
             sums: gpu.buffer("loss sums", pixels.div_ceil(32) * 4)?,
             v_image: gpu.buffer("v_image", pixels * 16)?,
             v_range: gpu.buffer("v_range", pixels * 4)?,
@@ -81,10 +82,10 @@ impl Loss {
         Ok(())
     }
 
-    /// Buffers that must be written before they are read: tests fill them with rubbish first.
+    /// Buffers that must be written before they are read. Tests fill them with garbage first.
     ///
     /// # Errors
-    /// When no room was made.
+    /// When [`Loss::prepare`] was not called.
     pub fn scratch(&self) -> Result<[&wgpu::Buffer; 4]> {
         let sized = self.sized()?;
         Ok([&sized.moments, &sized.partials, &sized.smoothed, &sized.sums])
@@ -96,26 +97,26 @@ impl Loss {
             .ok_or_else(|| crate::CoreError::Gpu("a loss was recorded before its buffers were made".into()))
     }
 
-    /// Gradient by the picture `[H*W]` vec4; the alpha entry is 0.
+    /// Gradient with respect to the image, `[H*W]` vec4; the alpha entry is 0.
     ///
     /// # Errors
-    /// When no room was made.
+    /// When [`Loss::prepare`] was not called.
     pub fn v_image(&self) -> Result<&wgpu::Buffer> {
         Ok(&self.sized()?.v_image)
     }
 
-    /// The photograph that was compared last, `[H*W]` packed: one buffer whatever the view.
+    /// The photograph of the last comparison, `[H*W]` packed; one buffer for all views.
     ///
     /// # Errors
-    /// When no room was made.
+    /// When [`Loss::prepare`] was not called.
     pub fn truth(&self) -> Result<&wgpu::Buffer> {
         Ok(&self.sized()?.truth)
     }
 
-    /// Gradient by the range image: 0, no term of this loss looks at it.
+    /// Gradient with respect to the range image: 0, because no term of this loss depends on it.
     ///
     /// # Errors
-    /// When no room was made.
+    /// When [`Loss::prepare`] was not called.
     pub fn v_range(&self) -> Result<&wgpu::Buffer> {
         Ok(&self.sized()?.v_range)
     }
@@ -123,7 +124,7 @@ impl Loss {
     /// Records the loss between `image` (the render) and `truth`.
     ///
     /// # Errors
-    /// When a kernel does not compile or no room was made.
+    /// When a kernel does not compile or [`Loss::prepare`] was not called.
     pub fn record(
         &self,
         gpu: &Gpu,
@@ -135,7 +136,7 @@ impl Loss {
     ) -> Result<()> {
         let sized = self.sized()?;
         let size = truth.size;
-        // A copy, so that the stages are bound to one buffer whatever the view.
+        // A copy, so that the kernels are bound to one buffer for all views.
         recorder.copy(&truth.pixels, &sized.truth);
         let [rows, columns, columns_backward] = match self.light {
             LossLight::Srgb => ["ssim_rows", "ssim_columns", "ssim_columns_backward"],

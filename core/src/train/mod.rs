@@ -1,10 +1,10 @@
 //! Training: one run over one set of views on one GPU.
 //!
-//! An iteration renders one view, compares it with its photograph and takes one step of Adam on the Gaussians
-//! that the view sees, all on the device. The host only queues iterations, looks now and then whether a list
-//! overflowed (then it grows the list and goes back to the first iteration that failed: the device did
-//! nothing since), and decides on density from numbers read back at fixed iterations. So the result depends
-//! on the run, the seed and the device alone: not on timing, capacities, batches or interruptions.
+//! An iteration renders one view, compares it with its photograph and takes one Adam step on the Gaussians
+//! that the view sees, all on the device. The host only queues iterations, periodically checks for list
+//! overflows, and decides on density from statistics read back at fixed iterations. After an overflow it
+//! grows the list and returns to the first iteration that failed; the device did nothing since. So the result
+//! depends only on the run, the seed and the device, and not on timing, capacities, batches or interruptions.
 
 mod background;
 mod backward;
@@ -56,31 +56,31 @@ use surfaces::Surfaces;
 pub use surfaces::surface_points;
 use target_images::TargetImages;
 
-/// One run: what to train, on what, for how long.
+/// One run: its Gaussians, views, water and configuration.
 pub struct TrainRun {
     /// Resolved configuration; `iterations` and `max_gaussians` are those of this run.
     pub config: TrainConfig,
-    /// [`crate::scene::learning_scale`] of the whole scene, scene units; the same for every partition, so
-    /// that learning rates are.
+    /// [`crate::scene::learning_scale`] of the whole scene, scene units. It is the same for every partition,
+    /// so that learning rates are equal.
     pub extent: f32,
     /// Views to train on.
     pub views: Arc<dyn ViewSource>,
     /// Gaussians that are trained and densified.
     pub focus: Gaussians,
-    /// Gaussians that are rendered but never change.
+    /// Frozen Gaussians: rendered, but never changed.
     pub context: Gaussians,
-    /// For each place that must stay covered a Gaussian that covers it ([`surface_points`]).
+    /// One covering Gaussian for each place that must stay covered ([`surface_points`]).
     pub surfaces: Gaussians,
-    /// The water between cameras and scene; `None` trains in sRGB without one.
+    /// The water between cameras and scene; `None` trains in sRGB without water.
     pub medium: Option<MediumRun>,
 }
 
-/// Where a run stands.
+/// Progress of a run.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Progress {
     /// Iterations done.
     pub iteration: u32,
-    /// Iterations in all.
+    /// Total iterations.
     pub iterations: u32,
     /// Gaussians in focus.
     pub gaussians: u32,
@@ -88,16 +88,16 @@ pub struct Progress {
     pub loss: f32,
 }
 
-/// Memory that a run takes on the device, bytes.
+/// Device memory of a run, bytes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct MemoryUse {
     /// Gaussians with their moments.
     pub gaussians: u64,
-    /// Lists by visible Gaussian.
+    /// Lists of visible Gaussians.
     pub per_visible: u64,
-    /// Lists by intersection, gradients included.
+    /// Lists of intersections, including gradients.
     pub per_intersection: u64,
-    /// Sums of the bands of views that are rendered in several.
+    /// Gradient sums of views that are rendered in several bands.
     pub bands: u64,
 }
 
@@ -107,21 +107,21 @@ pub struct Trainer {
     config: TrainConfig,
     schedule: Schedule,
     extent: f32,
-    /// Digest of everything that decides the result; a checkpoint belongs to it.
+    /// Digest of everything that determines the result; a checkpoint carries it.
     run_digest: [u8; 32],
     targets: TargetImages,
     blocks: Blocks,
     frame: Frame,
     loss: Loss,
-    /// What is between Gaussians and loss.
+    /// The appearances between Gaussians and loss.
     appearances: Chain,
-    /// Where WaterParamPredict decides the water at first.
+    /// Set if WaterParamPredict determines the water at first.
     predictor: Option<Predictor>,
-    /// Where surfaces must stay covered.
+    /// Set if there are surfaces that must stay covered.
     surfaces: Option<Surfaces>,
     slot_gradients: wgpu::Buffer,
     step: wgpu::Buffer,
-    /// Bands of the views (index and level) whose lists would be too long for the device.
+    /// Number of bands of the views (index and level) whose lists would be too long for the device.
     bands: HashMap<(usize, u32), u32>,
     iteration: u32,
     /// Gaussians in focus at the start of the run: growth is geometric from here.
@@ -130,7 +130,7 @@ pub struct Trainer {
 }
 
 impl TrainRun {
-    /// What decides on the appearances of the run.
+    /// The settings that determine the appearances of the run.
     pub fn settings(&self) -> Settings<'_> {
         settings(&self.config, self.medium.as_ref())
     }
@@ -141,7 +141,7 @@ fn settings<'a>(train: &'a TrainConfig, medium: Option<&'a MediumRun>) -> Settin
 }
 
 impl Trainer {
-    /// A run from its beginning.
+    /// Starts a run.
     ///
     /// # Errors
     /// When there are no views, no Gaussians, or the device cannot hold them.
@@ -151,7 +151,7 @@ impl Trainer {
         }
         if run.focus.is_empty() {
             return Err(CoreError::Scene(
-                "there are no Gaussians to train: the scene has no points where this partition is".into(),
+                "there are no Gaussians to train: the scene has no points in this partition".into(),
             ));
         }
         let run_digest = checkpoint::run_digest(&run);
@@ -162,13 +162,14 @@ impl Trainer {
         let mut blocks = Blocks::new(&gpu, config.sh_degree)?;
         blocks.push_trainable(&gpu, &focus, config.max_gaussians, config.moments)?;
         blocks.push_frozen(&gpu, &context, &spatial_order(&context))?;
-        // Else what was uploaded stays in staging buffers beside what is made now.
+        // Otherwise the uploads stay in staging buffers while the next buffers are made.
         gpu.wait()?;
         let gaussians = config.max_gaussians.max(focus.len() as u32) + context.len() as u32;
         let lists = lists(&gpu, &config, views.views(), &focus, &context, medium.as_ref());
         let mut frame = Frame::new(&gpu, gaussians, lists.visible, lists.intersections)?;
         let slot_gradients = slot_gradients(&gpu, &frame)?;
-        // For the largest picture: a run that cannot hold it fails here, not when it comes to full size.
+        // Sized for the largest image, so that a run that cannot hold it fails here and not at full
+        // resolution.
         let light = medium.as_ref().map_or(LossLight::Srgb, |medium| medium.config.loss_light);
         let mut loss = Loss::new(&gpu)?.in_light(light).times(config.loss_factor);
         let schedule = Schedule::new(&config, medium.as_ref());
@@ -216,10 +217,11 @@ impl Trainer {
         Ok(trainer)
     }
 
-    /// The same run from a checkpoint of it; gives the bytes that an uninterrupted run gives.
+    /// Resumes the same run from one of its checkpoints. The result has the same bytes as an uninterrupted
+    /// run.
     ///
     /// # Errors
-    /// [`CoreError::Checkpoint`] when the bytes are torn or belong to another run: start anew then.
+    /// [`CoreError::Checkpoint`] when the bytes are torn or belong to another run; start a new run then.
     pub fn resume(gpu: Arc<Gpu>, run: TrainRun, checkpoint: &[u8]) -> Result<Self> {
         let mut trainer = Self::new(gpu, run)?;
         checkpoint::restore(&mut trainer, checkpoint)?;
@@ -247,7 +249,7 @@ impl Trainer {
         Ok(self.progress())
     }
 
-    /// Where the run stands; `iteration == iterations` means done.
+    /// Progress of the run; `iteration == iterations` means done.
     pub fn progress(&self) -> Progress {
         Progress {
             iteration: self.iteration,
@@ -257,7 +259,7 @@ impl Trainer {
         }
     }
 
-    /// Everything that a resumed run needs, with a digest at its end.
+    /// Everything that a resumed run needs, followed by a digest.
     ///
     /// # Errors
     /// When the device fails.
@@ -265,8 +267,7 @@ impl Trainer {
         checkpoint::save(self)
     }
 
-    /// The Gaussians in focus as they are now and as they are rendered: with the 3D filter of Mip-Splatting
-    /// where it is on.
+    /// The current Gaussians in focus as they are rendered: with the 3D filter of Mip-Splatting if it is on.
     ///
     /// # Errors
     /// When the device fails.

@@ -1,5 +1,6 @@
-//! WaterParamPredict in a run (SMP-UWGS section 3.2): for the first part of it the nine numbers of the water
-//! are what the network says of a view's ranges (eq. 8), then its mean over the training views.
+//! WaterParamPredict in a run (SMP-UWGS section 3.2). In the first part of a run, the water parameters are
+//! the network's prediction from the ranges of a view (eq. 8). After that they are its mean prediction over
+//! the training views.
 //!
 //! ```text
 //! iteration     b-E ............... b ............... b+E ............... b+2E
@@ -9,17 +10,18 @@
 //! thread                            | predict -----> enters                 | learn
 //! ```
 //!
-//! Every E = `water.network.every` iterations the host reads ranges and alpha of the last view, and the sum
-//! of the gradients by the nine unconstrained numbers over the iterations under the water of now. A thread
-//! takes a step of learning for the view that this water was made of, through the weights of now, and
-//! predicts for the new view, while the device goes on; what it says enters E iterations later, whenever it
-//! was done. So the bytes of a run do not depend on who is faster. With E = 0 it is made of the view of the
-//! iteration itself, between blending and water, and the device waits.
+//! Every E = `water.network.every` iterations the host reads the ranges and alpha of the last view. It also
+//! reads the sum of the gradients with respect to the unconstrained water parameters over the iterations
+//! under the current water. While the device continues, a thread takes a learning step with the current
+//! weights, for the view that the current water was predicted from. It then predicts for the new view. The
+//! prediction takes effect E iterations later, no matter when it was ready. So the bytes of a run do not
+//! depend on which of the two is faster. With E = 0 the prediction is made from the view of the iteration
+//! itself, between blending and water, and the device waits.
 //!
-//! What the trainer does with it is in `in_run`.
+//! `in_run` holds the trainer's side.
 //!
-//! What must always hold: weights and what waits to enter are a function of the iterations done, and all of
-//! it is in a checkpoint.
+//! Invariant: the weights and the pending prediction are functions of the iterations done, and a checkpoint
+//! contains both.
 
 mod in_run;
 
@@ -32,9 +34,9 @@ use crate::nets::{DepthMap, RangeImage, WaterParamNet, WaterParamPredictor};
 use crate::water::{Water, four_digits};
 use crate::{CoreError, Result};
 
-/// Joint standard errors beyond which network and sparse points disagree.
+/// Number of joint standard errors beyond which network and sparse points disagree.
 const DISAGREES: f64 = 3.0;
-/// The nine numbers, in the order of eq. 8.
+/// The water parameters, in the order of eq. 8.
 const NAMES: [&str; 9] = [
     "beta_d red",
     "beta_d green",
@@ -47,49 +49,49 @@ const NAMES: [&str; 9] = [
     "b_inf blue",
 ];
 
-/// The network of a run, and what it is about.
+/// The network of a run, and its state.
 pub(super) struct Predictor {
     config: NetworkConfig,
-    /// Scene units by which the unconstrained numbers are multiplied.
+    /// Scene scale, scene units: the unit of the unconstrained parameters.
     unit: f64,
     sparse: Option<([f64; 9], [f64; 9])>,
-    /// First iteration that it does not decide.
+    /// First iteration whose water it does not determine.
     end: u32,
     network: Arc<Mutex<Box<dyn WaterParamPredictor>>>,
-    /// What the water of now was made of; `None` where that is still the one of the start.
+    /// The depth map that the current water was predicted from; `None` for the initial water.
     used: Option<DepthMap>,
     work: Work,
     left_out: LeftOut,
-    /// Of the nine numbers, once it has decided the water of the run.
+    /// Standard errors of the water parameters, once it has determined the water of the run.
     standard_error: Option<[f64; 9]>,
 }
 
-/// What a thread does, or has done.
+/// The work of the thread.
 enum Work {
     None,
-    Running(JoinHandle<Result<Said>>),
-    Done(Said),
+    Running(JoinHandle<Result<Prediction>>),
+    Done(Prediction),
 }
 
-/// What the network says of a view; `raw` is `None` where it was not finite.
-struct Said {
+/// The network's prediction for a view; `raw` is `None` if it was not finite.
+struct Prediction {
     depth: DepthMap,
     raw: Option<[f32; 9]>,
-    /// Whether a step of learning was left out before.
+    /// Whether the learning step before it was skipped.
     left_out: bool,
 }
 
-/// What was not finite.
+/// Counts of results that were not finite.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 struct LeftOut {
     gradients: u32,
     predictions: u32,
 }
 
-/// What was rendered of a view, row-major.
+/// Rendered ranges and alpha of a view, row-major.
 struct Seen {
     size: [u32; 2],
-    /// Blended, scene units.
+    /// Blended ranges, scene units.
     ranges: Vec<f32>,
     alphas: Vec<f32>,
 }
@@ -102,14 +104,15 @@ impl Seen {
 }
 
 impl Predictor {
-    /// The network at the start of a run that it decides up to iteration `end`; `None` where there is none.
+    /// The network of a new run, which determines the water up to iteration `end`; `None` if the run has no
+    /// network.
     ///
     /// # Errors
-    /// When the configuration names a network that there cannot be.
+    /// When the configuration of the network is invalid.
     pub fn new(run: &MediumRun, end: u32, seed: u32) -> Result<Option<Self>> {
         let Some(network) = run.network.filter(|_| run.is_free) else { return Ok(None) };
         let config = run.config.network.clone();
-        // As it is asked later, so that a size that does not fit is refused now.
+        // The same call as later, so that an invalid size is refused now.
         DepthMap::new(config.width, config.height, vec![0.0; (config.width * config.height) as usize])?;
         let net = WaterParamNet::new(config.channels, run.water.to_raw(run.unit), seed)?;
         Ok(Some(Self {
@@ -125,7 +128,7 @@ impl Predictor {
         }))
     }
 
-    /// First iteration after `iteration` at whose start it has something to do on its own.
+    /// First iteration after `iteration` at whose start the network has work to do.
     pub fn next_due(&self, iteration: u32) -> u32 {
         if iteration >= self.end {
             return u32::MAX;
@@ -135,38 +138,37 @@ impl Predictor {
         next.min(self.end)
     }
 
-    /// Whether an iteration's water is made of the view that it renders.
+    /// Whether the water of an iteration is predicted from the view that it renders.
     pub fn is_at_once(&self, iteration: u32) -> bool {
         self.config.every == 0 && iteration < self.end
     }
 
-    /// Steps of learning that were left out.
+    /// Skipped learning steps.
     pub fn steps_left_out(&self) -> u32 {
         self.left_out.gradients
     }
 
-    /// What the thread has said, which it is waited for; `None` where nobody has asked.
-    fn take_said(&mut self) -> Result<Option<Said>> {
-        let said = match std::mem::replace(&mut self.work, Work::None) {
+    /// Waits for the prediction of the thread; `None` if none was started.
+    fn take_prediction(&mut self) -> Result<Option<Prediction>> {
+        let prediction = match std::mem::replace(&mut self.work, Work::None) {
             Work::None => return Ok(None),
-            Work::Done(said) => said,
+            Work::Done(prediction) => prediction,
             Work::Running(thread) => {
-                let said = thread
-                    .join()
-                    .map_err(|_| CoreError::Network("the thread that it runs on has failed".into()))??;
-                self.left_out.gradients += u32::from(said.left_out);
-                self.left_out.predictions += u32::from(said.raw.is_none());
-                said
+                let prediction =
+                    thread.join().map_err(|_| CoreError::Network("its thread panicked".into()))??;
+                self.left_out.gradients += u32::from(prediction.left_out);
+                self.left_out.predictions += u32::from(prediction.raw.is_none());
+                prediction
             }
         };
-        Ok(Some(said))
+        Ok(Some(prediction))
     }
 
-    /// Has a thread learn from `gathered`, for the view that the water of now was made of, and then predict
-    /// for `seen`.
+    /// Starts a thread that first learns from `learned`: the depth map that the current water was predicted
+    /// from, and the gradients under it. Then it predicts for `seen`.
     fn start(&mut self, learned: Option<(DepthMap, [f32; 9])>, seen: Seen) -> Result<()> {
         let (network, config, unit) = (Arc::clone(&self.network), self.config.clone(), self.unit as f32);
-        // The thread gets a clone, so that this one is left when the system cannot start a thread.
+        // The thread gets a clone, so that the task remains if the system cannot start a thread.
         let task = Arc::new((learned, seen));
         let work = {
             let task = Arc::clone(&task);
@@ -177,18 +179,18 @@ impl Predictor {
         self.work = match std::thread::Builder::new().name("water network".into()).spawn(work) {
             Ok(thread) => Work::Running(thread),
             Err(error) => {
-                tracing::debug!(%error, "no thread for the network of the water; the run waits for it");
-                let said = learn_and_predict(&network, &config, unit, &task.0, &task.1)?;
-                self.left_out.gradients += u32::from(said.left_out);
-                self.left_out.predictions += u32::from(said.raw.is_none());
-                Work::Done(said)
+                tracing::debug!(%error, "cannot start a thread for the network of the water; training waits for it");
+                let prediction = learn_and_predict(&network, &config, unit, &task.0, &task.1)?;
+                self.left_out.gradients += u32::from(prediction.left_out);
+                self.left_out.predictions += u32::from(prediction.raw.is_none());
+                Work::Done(prediction)
             }
         };
         Ok(())
     }
 
-    /// A step of learning for `depth`; gives the gradient by its values where that is asked for and the step
-    /// was taken.
+    /// Takes a learning step for `depth`. Returns the gradient with respect to its values if `wants_depth` is
+    /// set and the step was taken.
     fn learn(&mut self, depth: &DepthMap, v_raw: [f32; 9], wants_depth: bool) -> Option<Vec<f32>> {
         let rate = self.config.learning_rate;
         match lock(&self.network).learn(depth, v_raw, rate, wants_depth) {
@@ -200,28 +202,32 @@ impl Predictor {
         }
     }
 
-    /// What it says of a view; counts what is not finite.
+    /// Predicts for a view; counts predictions that are not finite.
     fn predict(&mut self, depth: &DepthMap) -> Option<[f32; 9]> {
-        let said = lock(&self.network).predict(depth).ok();
-        self.left_out.predictions += u32::from(said.is_none());
-        said
+        let prediction = lock(&self.network).predict(depth).ok();
+        self.left_out.predictions += u32::from(prediction.is_none());
+        prediction
     }
 
     fn depth_map(&self, seen: &Seen) -> Result<DepthMap> {
         DepthMap::from_render(&seen.image(), self.config.width, self.config.height, self.unit as f32)
     }
 
-    /// Its state, for a checkpoint; a thread is waited for.
+    /// Its state for a checkpoint; waits for the thread.
     ///
-    /// Little-endian: counts of what was left out, whether it has decided, the standard errors, the depth map
-    /// that the water of now was made of, the depth map and the numbers that enter next, each after a flag,
-    /// and the network where it has not yet decided.
+    /// Layout, little-endian:
+    ///
+    /// 1. counts of skipped steps and predictions, and whether it has determined the water
+    /// 2. the standard errors
+    /// 3. each after a flag: the depth map of the current water, and the depth map and values of the next
+    ///    prediction
+    /// 4. the network, if it has not yet determined the water
     ///
     /// # Errors
-    /// When the thread has failed.
+    /// When the thread panicked.
     pub fn save(&mut self) -> Result<Vec<u8>> {
-        if let Some(said) = self.take_said()? {
-            self.work = Work::Done(said);
+        if let Some(prediction) = self.take_prediction()? {
+            self.work = Work::Done(prediction);
         }
         let mut bytes = Vec::new();
         for word in
@@ -235,22 +241,22 @@ impl Predictor {
             values.unwrap_or_default().iter().for_each(|value| bytes.extend(value.to_le_bytes()));
         };
         let next = match &self.work {
-            Work::Done(said) => Some(said),
+            Work::Done(prediction) => Some(prediction),
             _ => None,
         };
         put(self.used.as_ref().map(DepthMap::values));
-        put(next.map(|said| said.depth.values()));
-        put(next.and_then(|said| said.raw.as_ref()).map(<[f32; 9]>::as_slice));
+        put(next.map(|prediction| prediction.depth.values()));
+        put(next.and_then(|prediction| prediction.raw.as_ref()).map(<[f32; 9]>::as_slice));
         if self.standard_error.is_none() {
             bytes.extend(lock(&self.network).to_bytes());
         }
         Ok(bytes)
     }
 
-    /// Takes the state that `save` gave.
+    /// Restores the state from `save`.
     ///
     /// # Errors
-    /// [`CoreError::Checkpoint`] when the bytes are torn or those of another network.
+    /// [`CoreError::Checkpoint`] when the bytes are torn or belong to another network.
     pub fn restore(&mut self, bytes: &[u8]) -> Result<()> {
         let mut rest = bytes;
         let mut take = |count: usize| -> Result<&[u8]> {
@@ -284,20 +290,21 @@ impl Predictor {
             None => Work::None,
             Some(depth) => {
                 let raw = raw.map(|raw| std::array::from_fn(|i| raw[i]));
-                Work::Done(Said { depth, raw, left_out: false })
+                Work::Done(Prediction { depth, raw, left_out: false })
             }
         };
         Ok(())
     }
 
-    /// Of the nine numbers, once it has decided.
+    /// Standard errors of the water parameters, once the network has determined the water.
     pub fn standard_error(&self) -> Option<[f64; 9]> {
         self.standard_error
     }
 
-    /// Standard errors of the nine numbers of `water`: the spread over the views, and how far the sparse
-    /// points are, where they can tell; infinite elsewhere. The network looks at ranges alone and has learnt
-    /// one water for all of them, so views that agree say little about how true it is.
+    /// Standard errors of the parameters of `water`: the spread over the views combined with the distance
+    /// from the sparse points. Infinite where the sparse points cannot determine a parameter. The network
+    /// sees only ranges and has learnt a single water for all of them. So agreement between views says little
+    /// about how accurate it is.
     fn errors_of(&self, water: &Water, spread: [f64; 9]) -> [f64; 9] {
         let Some((sparse, errors)) = self.sparse else { return [f64::INFINITY; 9] };
         let values = water.to_array();
@@ -307,26 +314,26 @@ impl Predictor {
         })
     }
 
-    /// Says in the log what it has decided, and what of it the sparse points contradict.
+    /// Logs the final water, and how far each parameter agrees with the sparse points.
     fn report(&self, water: &Water, spread: &[f64; 9], views: usize) {
         let LeftOut { gradients, predictions } = self.left_out;
         if gradients + predictions > 0 {
             tracing::warn!(
                 gradients,
                 predictions,
-                "what was not finite was left out of the network of the water; a lower water.network.learning_rate helps"
+                "skipped steps or predictions of the water network that were not finite; lower water.network.learning_rate"
             );
         }
         tracing::info!(
             views,
             water = ?water.in_short(),
             spread = ?spread.map(four_digits),
-            "the water by WaterParamPredict: mean and deviation over views"
+            "WaterParamPredict determined the water: mean and standard deviation over views"
         );
         let Some((sparse, errors)) = self.sparse else { return };
         for i in 0..9 {
             let (found, points) = (water.to_array()[i], sparse[i]);
-            // What the points cannot tell contradicts nothing.
+            // A parameter that the points cannot determine contradicts nothing.
             let distance = joint_distance(found - points, spread[i], errors[i]);
             let name = NAMES[i];
             if distance > DISAGREES {
@@ -338,29 +345,29 @@ impl Predictor {
     }
 }
 
-/// A difference of two numbers over their joint standard error; an error that is not known is infinite.
+/// A difference of two values over their joint standard error; an unknown error is infinite.
 fn joint_distance(difference: f64, one: f64, other: f64) -> f64 {
     let joint = one.hypot(other);
     if joint.is_finite() { difference.abs() / joint.max(1e-12) } else { 0.0 }
 }
 
-/// The work of a thread: a step of learning with the gradient by what was said of a depth map, and what it
-/// says of `seen`.
+/// The work of a thread: a learning step with the gradient of an earlier prediction, then the prediction for
+/// `seen`.
 fn learn_and_predict(
     network: &Mutex<Box<dyn WaterParamPredictor>>,
     config: &NetworkConfig,
     unit: f32,
     learned: &Option<(DepthMap, [f32; 9])>,
     seen: &Seen,
-) -> Result<Said> {
+) -> Result<Prediction> {
     let mut network = lock(network);
     let left_out = learned.as_ref().is_some_and(|(depth, v_raw)| {
-        // A network that has diverged says so again below.
+        // If the network has diverged, the prediction below fails too.
         !network.learn(depth, *v_raw, config.learning_rate, false).is_ok_and(|learned| learned.stepped)
     });
     let depth = DepthMap::from_render(&seen.image(), config.width, config.height, unit)?;
     let raw = network.predict(&depth).ok();
-    Ok(Said { depth, raw, left_out })
+    Ok(Prediction { depth, raw, left_out })
 }
 
 fn lock<T: ?Sized>(mutex: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {
@@ -390,12 +397,12 @@ mod tests {
         let run = MediumRun { network, ..MediumRun::fixed(&config, Composition::PixelsLinear, 1.0) };
         match Predictor::new(&run, 10, 1) {
             Ok(Some(predictor)) => predictor,
-            _ => panic!("there is a network"),
+            _ => panic!("no network"),
         }
     }
 
     #[test]
-    fn it_is_due_once_a_cadence_and_at_the_end_of_its_part() {
+    fn predictions_are_due_at_every_interval_and_at_the_end() {
         let mut predictor = predictor();
         assert_eq!([0, 3, 4, 7, 8, 9, 10].map(|at| predictor.next_due(at)), [4, 4, 8, 8, 10, 10, u32::MAX]);
         assert!(!predictor.is_at_once(0));
@@ -407,7 +414,7 @@ mod tests {
     }
 
     #[test]
-    fn its_state_survives_a_checkpoint_and_a_torn_one_is_refused() {
+    fn the_state_survives_a_checkpoint_and_torn_bytes_are_refused() {
         let mut before = predictor();
         let seen = Seen { size: [32, 32], ranges: vec![1.5; 1024], alphas: vec![0.9; 1024] };
         let Ok(depth) = before.depth_map(&seen) else { panic!("a depth map") };
@@ -421,8 +428,9 @@ mod tests {
         assert!(after.restore(&bytes).is_ok());
         assert_eq!(after.save().ok(), Some(bytes.clone()));
         assert_eq!((after.left_out, &after.used), (before.left_out, &before.used));
-        let entering =
-            |predictor: &mut Predictor| predictor.take_said().ok().flatten().and_then(|said| said.raw);
+        let entering = |predictor: &mut Predictor| {
+            predictor.take_prediction().ok().flatten().and_then(|prediction| prediction.raw)
+        };
         let raw = entering(&mut before);
         assert!(raw.is_some());
         assert_eq!(entering(&mut after), raw);
@@ -433,10 +441,14 @@ mod tests {
     }
 
     #[test]
-    fn the_sparse_points_widen_the_error_by_their_distance_where_they_can_tell() {
+    fn the_distance_from_known_sparse_points_widens_the_error() {
         let mut predictor = predictor();
         let water = Water::from_array([0.5; 9]);
-        assert_eq!(predictor.errors_of(&water, [0.3; 9]), [f64::INFINITY; 9], "they cannot tell");
+        assert_eq!(
+            predictor.errors_of(&water, [0.3; 9]),
+            [f64::INFINITY; 9],
+            "the sparse points are unknown"
+        );
         predictor.sparse = Some(([0.1; 9], [0.01; 9]));
         assert!(predictor.errors_of(&water, [0.3; 9]).iter().all(|error| (error - 0.5).abs() < 1e-12));
         predictor.sparse = None;
@@ -444,7 +456,7 @@ mod tests {
     }
 
     #[test]
-    fn numbers_disagree_by_their_joint_error_and_never_with_what_is_not_known() {
+    fn parameters_disagree_by_joint_error_but_not_with_unknown_ones() {
         assert!((joint_distance(-1.0, 0.3, 0.4) - 2.0).abs() < 1e-12);
         assert_eq!(joint_distance(5.0, 0.1, f64::INFINITY), 0.0);
         assert!(joint_distance(1e-3, 0.0, 0.0) > DISAGREES);

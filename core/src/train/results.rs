@@ -1,4 +1,4 @@
-//! What a run has found so far: Gaussians, water, exposures, embeddings; and the memory that it takes.
+//! Results of a run so far: Gaussians, water, exposures, embeddings; and its memory use.
 
 use super::{DeviceMedium, Exposures, Film, FilmEmbedding, MediumRun, MemoryUse, Predictor, Trainer};
 use crate::Result;
@@ -11,7 +11,7 @@ impl Trainer {
         &self.blocks
     }
 
-    /// Exposure of each training view, rows r, g, b of a 3x4 affine map of the rendered colours; empty where
+    /// Exposure of each training view, rows r, g, b of a 3x4 affine map of the rendered colours; empty if
     /// `train.exposure` is off.
     ///
     /// # Errors
@@ -21,7 +21,7 @@ impl Trainer {
         exposures.map_or(Ok(Vec::new()), |exposures| exposures.download(&self.gpu))
     }
 
-    /// Embedding of each training view, two numbers a hidden unit; empty where `water.film` is off.
+    /// Embedding of each training view, two numbers per hidden unit; empty if `water.film` is off.
     ///
     /// # Errors
     /// When the device fails.
@@ -30,7 +30,7 @@ impl Trainer {
         film.map_or(Ok(Vec::new()), |film| film.embeddings(&self.gpu))
     }
 
-    /// The water as it is now; `None` where the run has none.
+    /// The current water; `None` if the run has none.
     ///
     /// # Errors
     /// When the device fails.
@@ -38,7 +38,7 @@ impl Trainer {
         self.appearances.water().map(|medium| medium.water(&self.gpu, &self.frame)).transpose()
     }
 
-    /// What is to be said of the water as it is now; `None` where the run has none.
+    /// The record of the current water; `None` if the run has none.
     ///
     /// # Errors
     /// When the device fails.
@@ -47,7 +47,7 @@ impl Trainer {
         self.appearances.water().map(record).transpose()
     }
 
-    /// How to render what is trained as its photographs show it; `None` where the run has no water.
+    /// How to render the trained model as its photographs show it; `None` if the run has no water.
     ///
     /// # Errors
     /// When the device fails.
@@ -59,8 +59,7 @@ impl Trainer {
         Ok(Some(WaterView { water, refinement, by_direction, composition, output: Output::Underwater }))
     }
 
-    /// Steps of the water, and of the network that predicts it, that were left out since a gradient was not
-    /// finite.
+    /// Skipped steps of the water, and of the network that predicts it, because a gradient was not finite.
     ///
     /// # Errors
     /// When the device fails.
@@ -69,7 +68,7 @@ impl Trainer {
         Ok(of_water + self.predictor.as_ref().map_or(0, Predictor::steps_left_out))
     }
 
-    /// Memory on the device.
+    /// Device memory in use.
     pub fn memory(&self) -> MemoryUse {
         let (per_visible, per_intersection) = self.frame.bytes();
         MemoryUse {

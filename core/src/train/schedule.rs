@@ -1,4 +1,5 @@
-//! Schedules: everything as a fraction of the run, so that a partition's short run behaves as a long one.
+//! Schedules: everything is a fraction of the run, so that the short run of a partition behaves like a long
+//! one.
 
 use crate::appearance::adam::interpolate_log;
 use crate::appearance::water::{MediumRun, WaterSchedule};
@@ -7,16 +8,16 @@ use crate::gpu::StepUniform;
 use crate::rng::{Stream, random_bits, uniform};
 use crate::scene::PinholeCamera;
 
-/// What happens when in a run.
+/// When things happen in a run.
 pub(super) struct Schedule {
     config: TrainConfig,
-    /// Density is decided every so many iterations after the first of these two, up to the second.
+    /// `densify_every` is the interval of density decisions, from after `densify_from` up to `densify_last`.
     densify_every: u32,
     densify_from: u32,
     densify_last: u32,
-    /// Iterations between two resets of opacities; 0: none.
+    /// Iterations between two resets of opacities; 0: no resets.
     reset_every: u32,
-    /// Of the water, where the run has one.
+    /// The schedule of the water, if the run has one.
     water: Option<WaterSchedule>,
 }
 
@@ -43,7 +44,7 @@ impl Schedule {
         }
     }
 
-    /// Share of the run that lies before an iteration.
+    /// Share of the run that is done before an iteration.
     pub(super) fn progress(&self, iteration: u32) -> f32 {
         iteration as f32 / self.config.iterations as f32
     }
@@ -64,12 +65,12 @@ impl Schedule {
             && (iteration - self.densify_from).is_multiple_of(self.densify_every)
     }
 
-    /// Whether density is decided at the start of an iteration, and never again.
+    /// Whether density is decided for the last time at the start of an iteration.
     pub(super) fn decides_last_at(&self, iteration: u32) -> bool {
         self.densifies_at(iteration) && iteration + self.densify_every > self.densify_last
     }
 
-    /// Whether opacities are reset at the start of an iteration: not at the end of densification (3DGS).
+    /// Whether opacities are reset at the start of an iteration; not at the end of densification (3DGS).
     pub(super) fn resets_at(&self, iteration: u32) -> bool {
         self.config.refine_steps > 0
             && self.reset_every > 0
@@ -82,7 +83,7 @@ impl Schedule {
         self.reset_every > 0 && iteration > self.reset_every
     }
 
-    /// How many Gaussians there should be at an iteration: geometric growth from `initial` to the cap.
+    /// Target number of Gaussians at an iteration: geometric growth from `initial` to the cap.
     pub(super) fn target_count(&self, iteration: u32, initial: u32) -> u32 {
         let cap = self.config.max_gaussians;
         let share = f64::from(self.progress(iteration)) / f64::from(self.config.grow_until.max(1e-6));
@@ -93,13 +94,13 @@ impl Schedule {
         ((f64::from(initial) * ratio.powf(share)) as u32).min(cap)
     }
 
-    /// How often the picture is halved: 2, 1, 0 on schedule, as far as it stays large enough.
+    /// How often the image is halved: 2, 1, 0 by schedule, less if the image would become too small.
     pub(super) fn level(&self, progress: f32, camera: &PinholeCamera) -> u32 {
         let wanted = self.config.resolution_at.iter().filter(|&&at| progress < at).count() as u32;
         TrainConfig::halvings(wanted, camera.width.max(camera.height))
     }
 
-    /// The schedule of the water, where the run has one.
+    /// The schedule of the water, if the run has one.
     pub(super) fn water(&self) -> Option<&WaterSchedule> {
         self.water.as_ref()
     }
@@ -113,7 +114,7 @@ impl Schedule {
         reached.min(u32::from(self.config.sh_degree))
     }
 
-    /// Colour behind everything at an iteration, sRGB: black, or drawn anew (uniform in each channel).
+    /// Background colour at an iteration, sRGB: black, or random (uniform in each channel).
     pub(super) fn background(&self, iteration: u32) -> [f32; 3] {
         if !self.config.random_background {
             return [0.0; 3];
@@ -121,14 +122,14 @@ impl Schedule {
         random_bits(self.config.seed, Stream::Background, iteration, 0).map(uniform)
     }
 
-    /// Rates and weights of one step, as if every view saw everything.
+    /// Learning rates and weights of one step, for a view that sees every Gaussian.
     pub(super) fn rates(&self, progress: f32, extent: f32) -> StepUniform {
         let c = &self.config;
         let means = extent * interpolate_log(c.means_lr, c.means_lr_end, progress);
         let falling = ((progress - c.anneal_from) / (1.0 - c.anneal_from).max(1e-6)).clamp(0.0, 1.0);
         let left = interpolate_log(1.0, c.anneal_to, falling);
         let (opacity_reg, scale_reg, noise) = match c.strategy {
-            // What fades now is relocated no more.
+            // Gaussians that fade now are not relocated any more.
             Strategy::Mcmc if progress >= self.progress(self.densify_last) => (0.0, 0.0, c.mean_noise),
             Strategy::Mcmc => (c.loss_factor * c.opacity_reg, c.loss_factor * c.scale_reg, c.mean_noise),
             Strategy::Classic => (0.0, 0.0, 0.0),
@@ -158,7 +159,7 @@ mod tests {
     }
 
     #[test]
-    fn the_cap_is_reached_by_half_of_the_run_and_never_passed() {
+    fn the_cap_is_reached_by_half_of_the_run_and_not_exceeded() {
         for iterations in [10, 333, 12_000] {
             let schedule = Schedule::new(&config(iterations, 5000), None);
             let counts: Vec<u32> = (0..=iterations).map(|i| schedule.target_count(i, 100)).collect();
@@ -169,7 +170,7 @@ mod tests {
     }
 
     #[test]
-    fn refinement_happens_the_configured_number_of_times_and_ends_on_time() {
+    fn density_is_decided_as_often_as_configured_and_in_time() {
         let schedule = Schedule::new(&config(12_000, 5000), None);
         let mut at = Vec::new();
         let mut next = schedule.next_refine(0);
@@ -184,7 +185,7 @@ mod tests {
     }
 
     #[test]
-    fn classic_refines_and_resets_at_the_shares_of_3dgs_and_has_no_weights_nor_noise() {
+    fn classic_densifies_and_resets_at_the_shares_of_3dgs() {
         let config = TrainConfig { strategy: Strategy::Classic, refine_steps: 145, ..config(30_000, 5000) };
         let schedule = Schedule::new(&config, None);
         let (mut densifies, mut resets, mut at) = (Vec::new(), Vec::new(), 0);
@@ -229,7 +230,7 @@ mod tests {
     }
 
     #[test]
-    fn small_pictures_are_not_halved_below_the_least_side() {
+    fn small_images_are_not_halved_below_the_smallest_side() {
         let schedule = Schedule::new(&config(1000, 5000), None);
         let camera = |side| PinholeCamera { width: side, height: 60, fx: 1.0, fy: 1.0, cx: 0.0, cy: 0.0 };
         assert_eq!(schedule.level(0.0, &camera(1600)), 2);

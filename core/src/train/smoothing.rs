@@ -1,11 +1,11 @@
-//! The 3D filter of Mip-Splatting (Yu et al. 2024, section 5.1): no Gaussian is finer than the training views
-//! sample it.
+//! The 3D filter of Mip-Splatting (Yu et al. 2024, section 5.1): no Gaussian is finer than its sampling by
+//! the training views.
 //!
-//! Each Gaussian is rendered as if convolved with an isotropic Gaussian (`smoothing.wgsl` says which), at the
-//! same integral: deviations become sqrt(s^2 + d^2), opacity is multiplied by the product of s / sqrt(s^2 +
-//! d^2). The widths are found at the start and whenever density was decided, since they follow from where
-//! Gaussians are. A model that is handed out has them in its scales and opacities, so that any viewer shows
-//! it as it was trained.
+//! Each Gaussian is rendered as if convolved with an isotropic Gaussian of standard deviation d (see
+//! `smoothing.wgsl`) that preserves its integral. Its scales become sqrt(s^2 + d^2), and its opacity is
+//! multiplied by the product of s / sqrt(s^2 + d^2). The widths depend on the positions of the Gaussians, so
+//! they are computed at the start and after every density decision. An exported model has them in its scales
+//! and opacities, so that any viewer shows it as it was trained.
 
 use super::Trainer;
 use crate::Result;
@@ -13,7 +13,7 @@ use crate::gaussians::Gaussians;
 use crate::gpu::{Gpu, Recorder, Size};
 use crate::views::TrainView;
 
-/// The views as `smoothing.wgsl` reads them.
+/// The views in the layout of `smoothing.wgsl`.
 pub(super) fn views_on_device(gpu: &Gpu, views: &[TrainView]) -> Result<wgpu::Buffer> {
     let mut rows: Vec<[f32; 4]> = Vec::with_capacity(5 * views.len());
     for TrainView { camera, pose, .. } in views {
@@ -30,7 +30,7 @@ pub(super) fn views_on_device(gpu: &Gpu, views: &[TrainView]) -> Result<wgpu::Bu
 }
 
 impl Trainer {
-    /// Finds how far each trainable Gaussian is smoothed, where the filter is on.
+    /// Computes the smoothing of each trainable Gaussian, if the filter is on.
     pub(super) fn update_smoothing(&self) -> Result<()> {
         if !self.config.mip_filter {
             return Ok(());
@@ -53,7 +53,7 @@ impl Trainer {
         self.gpu.release_unused()
     }
 
-    /// Deviation of the filter of each trainable Gaussian, scene units; 0 where it is off.
+    /// Standard deviation of the filter of each trainable Gaussian, scene units; 0 if the filter is off.
     pub(super) fn smoothing(&self) -> Result<Vec<f32>> {
         let mut all = Vec::new();
         for (_, block, training) in self.blocks.trainable() {
@@ -64,7 +64,8 @@ impl Trainer {
     }
 }
 
-/// The model with the 3D filter in its scales and opacities; `smoothing` `[N]`, deviations in scene units.
+/// The model with the 3D filter in its scales and opacities; `smoothing` `[N]`: standard deviations, scene
+/// units.
 pub fn smoothed(mut model: Gaussians, smoothing: &[f32]) -> Gaussians {
     for (index, &width) in smoothing.iter().enumerate().filter(|(_, width)| **width > 0.0) {
         let mut share = 1.0;

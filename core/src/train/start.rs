@@ -1,4 +1,5 @@
-//! What a run under water starts from: its nine numbers, and what the sparse points look like without it.
+//! The start of a run with water: its initial water parameters, and the colours of the sparse points without
+//! the water.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -13,26 +14,26 @@ use crate::scene::Points;
 use crate::views::{Mapped, TrainView, ViewSource};
 use crate::water::{Water, four_digits, ray_maps, water_prior};
 
-/// Least coefficient to start from, in 1 / the usual viewing distance.
+/// Smallest initial coefficient, in 1 / scene scale.
 const LEAST: f64 = 2e-3;
-/// Least colour at infinity to start from, linear light: a third of an 8-bit code, so that it shows nowhere.
-/// At 2e-3, which is seven codes, no red of the far reef of reef-clip could be darker, which cost 0.002 of
-/// the SSIM of red.
+/// Smallest initial colour at infinity, linear light: a third of an 8-bit code, so that it is invisible. With
+/// 2e-3, which is seven codes, no red of the far reef of reef-clip could be darker, which cost 0.002 of the
+/// SSIM of red.
 const LEAST_COLOUR: f64 = 1e-4;
-/// J of a point, linear light: neither black, where no gradient brings it back, nor brighter than white.
+/// J of a point, linear light: not black, because it would have no gradient, and not brighter than white.
 const CLEAR: [f64; 2] = [2e-3, 1.0];
 
-/// What a run under water starts from.
+/// The start of a run with water.
 #[derive(Clone, Debug)]
 pub struct StartingWater {
     /// The water, free to move.
     pub medium: MediumRun,
-    /// The sparse points with the colours that they would have without the water.
+    /// The sparse points with their colours without the water.
     pub points: Points,
 }
 
-/// The views of a run under `medium`: with maps of what their rays end on, and how far away, where
-/// photographs were searched for open water.
+/// The views of a run with `medium`. If photographs were searched for open water, each view gets a map of
+/// what its rays hit, and at which range.
 ///
 /// `scene_views` as [`crate::water::observe`] takes them.
 ///
@@ -53,11 +54,11 @@ pub fn with_ray_maps(
     Ok(Arc::new(Mapped::new(Arc::clone(views), maps)?))
 }
 
-/// Finds the water that a run starts from; `None` where the configuration has no medium.
+/// Finds the initial water of a run; `None` if the configuration has no medium.
 ///
-/// `unit` is the usual viewing distance, scene units; `scene_views` as [`crate::water::observe`] takes them.
-/// Where the sparse points tell nothing, that is said in the log, and the run starts from the numbers of the
-/// configuration. A network is compared with the sparse points even where it does not begin with them.
+/// `unit` is the scene scale, scene units; `scene_views` as [`crate::water::observe`] takes them. If the
+/// sparse points give no estimate, a log message says so and the run starts from the values of the
+/// configuration. A network is compared with the sparse points even if it does not start from them.
 ///
 /// # Errors
 /// When a photograph cannot be read.
@@ -85,9 +86,11 @@ pub fn starting_water(
                 observations = sparse.observations,
                 water = ?sparse.water.in_short(),
                 standard_error = ?sparse.standard_error.map(four_digits),
-                "the water by the sparse points"
+                "estimated the water from the sparse points"
             ),
-            Err(error) => tracing::warn!(%error, "the run starts from water.start_* of the configuration"),
+            Err(error) => {
+                tracing::warn!(%error, "the sparse points give no water; the run starts from water.start_* of the configuration")
+            }
         }
         if let Some(open) = &prior.open {
             let (colour, error) = open.colour();
@@ -102,7 +105,7 @@ pub fn starting_water(
         if prior.by_darkness.contains(&true) {
             let (water, errors) =
                 (prior.water.as_ref().map(Water::in_short), prior.standard_error.map(four_digits));
-            tracing::info!(?water, standard_error = ?errors, channels = ?prior.by_darkness, "the veil by the darkest pixels");
+            tracing::info!(?water, standard_error = ?errors, channels = ?prior.by_darkness, "estimated the backscatter from the darkest pixels");
         }
         if let Some(water) = prior.water {
             if let Some(network) = &mut medium.network {
@@ -133,8 +136,8 @@ pub fn starting_water(
     Ok(Some(StartingWater { medium, points: Points { colours, ..points.clone() } }))
 }
 
-/// Sparse points with the colours that they have without the water of `medium`, each at its mean range from
-/// the views that saw it; where that is not known, at the usual viewing distance. `scene_views` as
+/// Sparse points with their colours without the water of `medium`. The range of a point is its mean range
+/// from the views that saw it, or the scene scale if that is unknown. `scene_views` as
 /// [`crate::water::observe`] takes them.
 pub fn clear_points(medium: &MediumRun, points: &Points, views: &[TrainView], scene_views: &[u32]) -> Points {
     let centres: HashMap<u32, DVec3> =
@@ -159,14 +162,14 @@ fn as_code(clear: [f64; 3]) -> [u8; 3] {
     clear.map(|light| (linear_to_srgb(light.clamp(CLEAR[0], CLEAR[1])) * 255.0).round() as u8)
 }
 
-/// J of an 8-bit sRGB colour that was seen at `range`, linear light.
+/// J of an 8-bit sRGB colour seen at `range`, linear light.
 fn without(water: &Water, colour: [u8; 3], range: f64) -> [f64; 3] {
     let seen = DVec3::from(colour.map(|code| srgb_to_linear(f64::from(code) / 255.0)));
     water.remove(seen, range).to_array()
 }
 
-/// `water` with numbers of at least [`LEAST`] and [`LEAST_COLOUR`]: at 0 the unconstrained ones have no
-/// gradient, so none could grow.
+/// `water` with values of at least [`LEAST`] and [`LEAST_COLOUR`]: at 0 the unconstrained parameters have no
+/// gradient, so they could not grow.
 pub(super) fn able_to_move(water: Water, unit: f64) -> Water {
     let least = |beta: [f64; 3]| beta.map(|value| value.max(LEAST / unit));
     Water {
@@ -181,19 +184,16 @@ mod tests {
     use super::*;
 
     #[test]
-    fn numbers_that_nobody_saw_can_grow_from_where_no_picture_shows_them() {
+    fn a_water_without_evidence_starts_invisible_and_can_grow() {
         let unit = 10.0;
         let nothing = Water { beta_d: [0.0; 3], beta_b: [0.0; 3], b_inf: [0.0; 3] };
         let start = able_to_move(nothing, unit);
         assert!(start.slopes(unit).iter().all(|slope| *slope > 5e-5), "{start:?} does not move");
         for code in start.b_inf.map(|light| 255.0 * linear_to_srgb(light)) {
-            assert!(code < 0.5, "open water is {code} codes bright where it is black");
+            assert!(code < 0.5, "open water is {code} codes bright, not black");
         }
         let weakened = start.remove(DVec3::ONE, unit).to_array();
-        assert!(
-            weakened.iter().all(|light| (light - 1.0).abs() < 0.005),
-            "{weakened:?} at a viewing distance"
-        );
-        assert_eq!(able_to_move(Water::COASTAL, unit), Water::COASTAL, "what is known stays");
+        assert!(weakened.iter().all(|light| (light - 1.0).abs() < 0.005), "{weakened:?} at the scene scale");
+        assert_eq!(able_to_move(Water::COASTAL, unit), Water::COASTAL, "known values stay");
     }
 }

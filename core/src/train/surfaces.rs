@@ -1,10 +1,10 @@
-//! Surfaces that must stay covered though the photographs hardly hold them: sparse points that several
-//! training views saw, all of them from so far that the water has taken half of the light.
+//! Surfaces that must stay covered although the photographs hardly constrain them. They are sparse points
+//! that several training views saw, all from so far away that the water has taken half of the light.
 //!
-//! A fog of faint Gaussians before and behind such a surface looks the same to views that look along it,
-//! since they look through much of it; a view from above looks through little of it and finds a hole. No term
-//! of a view sees that, so it is asked of the Gaussians: around each of these points their opacities must add
-//! up, from whichever side one looks.
+//! A fog of faint Gaussians around such a surface looks the same in views along the surface, because they
+//! look through much of the fog. A view from above looks through little of it and shows a hole. No loss of a
+//! view detects that, so the Gaussians are checked directly. Around each of these points their opacities must
+//! add up to a cover, from any direction.
 
 use std::collections::HashMap;
 
@@ -22,29 +22,30 @@ use crate::scene::Points;
 use crate::views::TrainView;
 use crate::water::Water;
 
-/// Views that must have seen a point, at least.
+/// Smallest number of views that must have seen a point.
 const LEAST_VIEWS: usize = 2;
 /// Opacity of a Gaussian that covers a point.
 const OPACITY: f32 = 0.9;
-/// A sparse point lies off its surface by about this share of the distance to its neighbours.
+/// Distance of a sparse point from its surface, as a share of the distance to its neighbours.
 const OFF: f32 = 0.5;
-/// Greatest deviation of a Gaussian that covers a point, in those of half of all.
+/// Largest standard deviation of a covering Gaussian, relative to their median.
 const WIDEST: f32 = 2.0;
-/// Deviations from a Gaussian at which it covers nothing.
+/// Distance beyond which a Gaussian covers nothing, in standard deviations.
 const REACH: f32 = 3.0;
-/// What covers less is left out, optical depth.
+/// Gaussians with less alpha at a point are ignored.
 const LEAST: f32 = 0.01;
-/// At most one point for so many Gaussians of the cap.
+/// At most one point per this many Gaussians of the cap.
 const SHARE_OF_CAP: u32 = 2;
-/// Noise of a point's colour as a share of how much colours of a scene differ.
+/// Noise of a point's colour, relative to the spread of the colours of a scene.
 const NOISE: f64 = 0.05;
-/// Gaussians whose cover is added up by one thread.
+/// Gaussians whose cover one thread adds up.
 const CHUNK: usize = 8192;
 
-/// Gaussians that cover what the photographs hardly hold: one for each sparse point that two of the views
-/// saw, all of them from farther than [`crate::water::Water::half_distance`]. In clear water there are none.
+/// Gaussians that cover surfaces which the photographs hardly constrain. There is one for each sparse point
+/// that at least two of the views saw, all from farther than [`crate::water::Water::half_distance`]. In clear
+/// water there are none.
 ///
-/// `points` have the colours of J; those that are not `inside` are left out. `scene_views` as
+/// `points` have the colours of J; points that are not `inside` are left out. `scene_views` as
 /// [`crate::water::observe`] takes them.
 ///
 /// # Errors
@@ -92,7 +93,7 @@ pub fn surface_points(
         ..Points::default()
     };
     let mut model = gaussians_from_points(&chosen, OPACITY, config.sh_degree)?;
-    // One that lies alone would be as wide as the scene.
+    // The Gaussian of an isolated point would be as wide as the scene.
     let mut widths: Vec<f32> = model.log_scales.iter().map(|scale| scale[0]).collect();
     let at = widths.len() / 2;
     let widest = *widths.select_nth_unstable_by(at, f32::total_cmp).1 + WIDEST.ln();
@@ -100,7 +101,7 @@ pub fn surface_points(
     Ok(model)
 }
 
-/// What the points of a scene look like in the mean: what a colour is taken for of which no light arrives.
+/// Mean colour of the points of a scene: the estimate for a colour whose light does not arrive.
 struct UsualColour<'a> {
     water: &'a Water,
     /// J, linear light.
@@ -108,7 +109,7 @@ struct UsualColour<'a> {
 }
 
 impl<'a> UsualColour<'a> {
-    /// `nearest` is the range of the nearest view that saw a point.
+    /// `nearest`: range of the nearest view that saw each point.
     fn of(points: &Points, nearest: &[Option<f64>], water: &'a Water) -> Self {
         let (mut sums, mut weights) = ([0.0; 3], [f64::MIN_POSITIVE; 3]);
         for (colour, range) in points.colours.iter().zip(nearest) {
@@ -122,7 +123,7 @@ impl<'a> UsualColour<'a> {
         Self { water, mean: std::array::from_fn(|c| sums[c] / weights[c]) }
     }
 
-    /// `colour`, led towards the mean as its noise at `range` asks: by the ratio of variances.
+    /// `colour`, moved towards the mean by the ratio of variances, given its noise at `range`.
     fn lead(&self, colour: [u8; 3], range: f64) -> [u8; 3] {
         let through = through(self.water, range);
         std::array::from_fn(|c| {
@@ -134,24 +135,24 @@ impl<'a> UsualColour<'a> {
     }
 }
 
-/// What share of the light of each channel arrives from `range`.
+/// Share of the light of each channel that arrives from `range`.
 fn through(water: &Water, range: f64) -> [f64; 3] {
     water.beta_d.map(|beta| (-beta * range).exp())
 }
 
-/// The surfaces of a run, made ready for questions.
+/// The surfaces of a run, with a search tree.
 pub(super) struct Surfaces {
-    /// A Gaussian for each point, as [`surface_points`] gives them.
+    /// The Gaussians of [`surface_points`], one per point.
     pub(super) model: Gaussians,
     tree: ImmutableKdTree<f32, 3>,
-    /// Farthest that a point may lie off its surface, scene units.
+    /// Largest distance of a point from its surface, scene units.
     farthest_off: f32,
-    /// Optical depth of what is rendered but never changes, around each point.
+    /// Optical depth of the frozen Gaussians around each point.
     frozen: Vec<f32>,
 }
 
 impl Surfaces {
-    /// `None` where there are none.
+    /// `None` if there are none.
     pub(super) fn new(model: Gaussians, context: &Gaussians) -> Result<Option<Self>> {
         if model.is_empty() {
             return Ok(None);
@@ -163,7 +164,7 @@ impl Surfaces {
         Ok(Some(surfaces))
     }
 
-    /// Points around which all Gaussians together have an optical depth below `least`, the barest first.
+    /// Points whose optical depth over all Gaussians is below `least`, the barest first.
     pub(super) fn bare(&self, trained: &[Transform], least: f32) -> Vec<u32> {
         let mut bare: Vec<(f32, u32)> = self
             .cover(trained.len(), |index| trained[index])
@@ -177,8 +178,8 @@ impl Surfaces {
         bare.into_iter().map(|(_, point)| point).collect()
     }
 
-    /// Optical depth of `count` Gaussians at each point: the sum of -ln(1 - alpha), each Gaussian convolved
-    /// with how far a point may lie off its surface. The sum runs in the order of the Gaussians, on any
+    /// Optical depth of `count` Gaussians at each point: the sum of -ln(1 - alpha). Each Gaussian is widened
+    /// by the distance of the point from its surface. The sum runs in the order of the Gaussians, for any
     /// number of threads.
     fn cover(&self, count: usize, gaussian: impl Fn(usize) -> Transform + Sync) -> Vec<f32> {
         let of_chunks: Vec<HashMap<u32, f32>> = (0..count.div_ceil(CHUNK))
@@ -197,8 +198,8 @@ impl Surfaces {
         cover
     }
 
-    /// Adds what a Gaussian (centre and logit of opacity, quaternion, logarithms of scales) covers of each
-    /// point around it.
+    /// Adds the cover that a Gaussian (centre and logit of opacity, quaternion, log scales) gives each point
+    /// around it.
     fn add_cover(&self, [centre, quat, log_scale]: &Transform, covers: &mut HashMap<u32, f32>) {
         let opacity = 1.0 / (1.0 + (-centre[3]).exp());
         let scale = Vec3::new(log_scale[0], log_scale[1], log_scale[2]).exp();
@@ -218,7 +219,7 @@ impl Surfaces {
             let slack = OFF * self.model.log_scales[at][0].exp();
             let wide = scale * scale + Vec3::splat(slack * slack);
             let alpha = opacity * (-0.5 * (off * off / wide).element_sum()).exp();
-            // Not where a quaternion of zeros makes it not a number.
+            // False for NaN, which a quaternion of zeros gives.
             if alpha > LEAST {
                 *covers.entry(point).or_insert(0.0) -= (1.0 - alpha.min(0.99)).ln();
             }
@@ -239,7 +240,7 @@ mod tests {
         }
     }
 
-    /// A floor of 20 x 20 points, 1 apart, each seen by `views`.
+    /// A floor of 20 x 20 points at a spacing of 1, each seen by `views`.
     fn floor(views: impl Fn(usize) -> Vec<u32>) -> Points {
         let positions: Vec<[f32; 3]> = (0..400).map(|i| [(i % 20) as f32, 0.0, (i / 20) as f32]).collect();
         let mut tracks = Tracks::default();
@@ -257,7 +258,7 @@ mod tests {
         })
     }
 
-    /// Farther than the light of half of the clearest channel.
+    /// Farther than the range at which half of the light of the clearest channel is left.
     const FAR: f64 = 60.0;
 
     fn config() -> TrainConfig {
@@ -284,7 +285,7 @@ mod tests {
     }
 
     #[test]
-    fn what_two_views_of_the_run_saw_from_far_must_be_covered_and_nothing_in_clear_water() {
+    fn points_that_two_views_saw_from_far_must_be_covered() {
         // Point 0 is seen by one view of the run, 1 by one and a held-out one, 2 by none.
         let points = floor(|point| match point {
             0 => vec![1],
@@ -303,11 +304,11 @@ mod tests {
         for none in [None, Some(&clear), Some(&off)] {
             assert!(of(FAR, none, |_| true).is_empty());
         }
-        assert!(of(0.5, Some(&murky()), |_| true).len() < 400, "the photographs hold what is near");
+        assert!(of(0.5, Some(&murky()), |_| true).len() < 400, "the photographs constrain near points");
         let untracked = Points { tracks: Tracks::default(), ..points.clone() };
         let all =
             surface_points(&untracked, &views(FAR), &[0, 1, 2], &config(), Some(&murky()), |_| true).unwrap();
-        assert_eq!(all.len(), 400, "where nobody knows who saw a point, all count");
+        assert_eq!(all.len(), 400, "without tracks, all points count");
         let few = TrainConfig { max_gaussians: 200, ..config() };
         let thinned =
             surface_points(&points, &views(FAR), &[0, 1, 2], &few, Some(&murky()), |_| true).unwrap();
@@ -315,7 +316,7 @@ mod tests {
     }
 
     #[test]
-    fn a_colour_of_which_no_light_arrives_is_the_usual_one_and_what_arrives_stays() {
+    fn a_colour_without_light_becomes_the_mean_and_others_stay() {
         let points =
             Points { colours: vec![[200, 100, 50], [100, 100, 50], [255, 10, 60]], ..Points::default() };
         let water = Water { beta_d: [0.5, 0.05, 0.01], ..Water::COASTAL };
@@ -326,11 +327,11 @@ mod tests {
         assert!((red - both.iter().sum::<f64>() / 2.0).abs() < 0.01, "{far:?}");
         assert!((11..30).contains(&far[1]), "a fifth of the green arrives: {far:?}");
         assert!(far[2].abs_diff(60) <= 1, "{far:?}");
-        assert_eq!(usual.lead([255, 10, 60], 0.1)[0].abs_diff(255), 0, "a point that is near keeps its own");
+        assert_eq!(usual.lead([255, 10, 60], 0.1)[0].abs_diff(255), 0, "a near point keeps its colour");
     }
 
     #[test]
-    fn a_point_that_lies_alone_gets_no_gaussian_as_wide_as_the_scene() {
+    fn an_isolated_point_gets_no_gaussian_as_wide_as_the_scene() {
         let mut points = floor(|_| vec![0, 1]);
         points.positions[7] = [500.0, 0.0, 0.0];
         let model =
@@ -339,7 +340,7 @@ mod tests {
     }
 
     #[test]
-    fn a_floor_is_bare_under_a_fog_and_where_nothing_is_and_not_where_something_opaque_is_near() {
+    fn a_floor_is_bare_unless_opaque_gaussians_are_near() {
         let surfaces = ready(&floor(|_| vec![0, 1]));
         let opaque = over(&surfaces, 0.1, 0.95, 0.5);
         assert!(surfaces.bare(&opaque, 2.0).is_empty());
@@ -347,10 +348,10 @@ mod tests {
         without_rotation.iter_mut().for_each(|[_, quat, _]| *quat = [0.0; 4]);
         for (what, gaussians) in [
             ("nothing", Vec::new()),
-            ("what has no rotation", without_rotation),
+            ("Gaussians without a rotation", without_rotation),
             ("a fog", over(&surfaces, 0.1, 0.1, 0.5)),
-            ("something far above", over(&surfaces, 6.0, 0.95, 0.5)),
-            ("what is not finite", over(&surfaces, f32::NAN, 0.95, 0.5)),
+            ("Gaussians far above", over(&surfaces, 6.0, 0.95, 0.5)),
+            ("Gaussians that are not finite", over(&surfaces, f32::NAN, 0.95, 0.5)),
         ] {
             assert_eq!(surfaces.bare(&gaussians, 2.0).len(), 400, "{what}");
         }
@@ -362,7 +363,7 @@ mod tests {
     }
 
     #[test]
-    fn what_never_changes_covers_too_and_faint_gaussians_add_up() {
+    fn frozen_gaussians_cover_too_and_faint_ones_add_up() {
         let points = floor(|_| vec![0, 1]);
         let model =
             surface_points(&points, &views(FAR), &[0, 1, 2], &config(), Some(&murky()), |_| true).unwrap();

@@ -1,7 +1,8 @@
-//! Photographs on the device: packed, the latest ones kept, the next ones fetched while the device works.
+//! Photographs on the device: packed, the most recently used ones kept, the next ones fetched while the
+//! device works.
 //!
-//! Which photograph an iteration takes is a function of seed and iteration, so what is fetched ahead, by how
-//! many threads and when it arrives changes nothing but the time that a run takes.
+//! The photograph of an iteration is a function of seed and iteration. So prefetching, its threads and its
+//! timing change only the duration of a run.
 
 use std::collections::{HashMap, VecDeque};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
@@ -14,7 +15,7 @@ use crate::picture::half;
 use crate::rng::{Stream, permutation, uniform_at};
 use crate::views::{PackedImage, TrainView, ViewSource};
 
-/// Photographs that are fetched ahead.
+/// Number of photographs to fetch ahead.
 const AHEAD: u32 = 8;
 
 /// A view, and how often its photograph is halved in linear light.
@@ -24,20 +25,20 @@ pub(super) type Key = (usize, u32);
 pub(super) struct TargetImages {
     views: Arc<dyn ViewSource>,
     seed: u32,
-    /// Orders of the views in the epochs that were asked for last.
+    /// View orders of the most recently used epochs.
     orders: VecDeque<(u32, Vec<u32>)>,
     resident: Arc<Mutex<Resident>>,
     ahead: Option<Ahead>,
 }
 
 impl TargetImages {
-    /// Without threads every photograph is waited for.
+    /// With 0 threads, nothing is fetched ahead.
     pub(super) fn new(views: Arc<dyn ViewSource>, seed: u32, threads: u32) -> Self {
         let ahead = Ahead::new(&views, threads);
         Self { views, seed, orders: VecDeque::new(), resident: Arc::default(), ahead }
     }
 
-    /// Has what is kept on a device dropped when its memory is short.
+    /// Lets the photographs kept on a device be dropped when its memory runs short.
     pub(super) fn gives_way(self, gpu: &Gpu) -> Self {
         gpu.give_way(&self.resident);
         self
@@ -47,8 +48,9 @@ impl TargetImages {
         self.views.views()
     }
 
-    /// The view of an iteration: every view once an epoch, in an order by seed and epoch; where views have
-    /// weights, each as often as its share of them, rounded up or down by epoch.
+    /// The view of an iteration. Every view appears once per epoch, in an order that depends on seed and
+    /// epoch. If views have weights, each appears in proportion to its share of them, rounded up or down per
+    /// epoch.
     pub(super) fn view_at(&mut self, iteration: u32) -> usize {
         let count = self.views().len();
         let (epoch, at) = ((iteration as usize / count) as u32, iteration as usize % count);
@@ -69,12 +71,12 @@ impl TargetImages {
         view
     }
 
-    /// How many iterations ahead [`TargetImages::expect`] is worth calling.
+    /// Number of iterations ahead for which [`TargetImages::expect`] is useful.
     pub(super) fn ahead(&self) -> u32 {
         if self.ahead.is_some() { AHEAD } else { 0 }
     }
 
-    /// Says that a photograph will be asked for soon.
+    /// Announces that a photograph will be loaded soon.
     pub(super) fn expect(&mut self, key: Key) {
         if let Some(ahead) = &self.ahead
             && !lock(&self.resident).photographs.contains_key(&key)
@@ -83,7 +85,7 @@ impl TargetImages {
         }
     }
 
-    /// A photograph on the device.
+    /// Loads a photograph onto the device.
     pub(super) fn load(&mut self, gpu: &Gpu, key: Key) -> Result<DevicePhotograph> {
         let resident = lock(&self.resident).take(key);
         if let Some(photograph) = resident {
@@ -100,9 +102,10 @@ impl TargetImages {
     }
 }
 
-/// As many indices of `weights` as it has, ascending, each floor or ceil of its share of them: a comb of even
-/// teeth over the sum of weights, which begins `offset` (0 to 1) of a tooth from 0. Over all offsets each
-/// share is met in the mean, and equal weights give every index once.
+/// Draws `weights.len()` indices by systematic sampling, ascending. Each appears the floor or the ceiling of
+/// its expected number of times.
+/// A comb of even spacing is laid over the cumulative weights, starting at `offset` (0 to 1) of one spacing.
+/// Over all offsets, the mean count of each index equals its share. Equal weights give every index once.
 fn systematic_sample(weights: &[f32], offset: f64) -> Vec<u32> {
     let tooth = weights.iter().map(|&weight| f64::from(weight)).sum::<f64>() / weights.len().max(1) as f64;
     let (mut index, mut reached) = (0, weights.first().map_or(0.0, |&first| f64::from(first)));
@@ -129,11 +132,11 @@ fn fetch(views: &dyn ViewSource, (index, level): Key) -> Result<Arc<PackedImage>
     Ok(image)
 }
 
-/// The photographs that were used last.
+/// The most recently used photographs.
 #[derive(Default)]
 struct Resident {
     photographs: HashMap<Key, DevicePhotograph>,
-    /// By the time of their last use, the latest last.
+    /// In the order of their last use, the latest last.
     order: VecDeque<Key>,
     bytes: u64,
 }
@@ -160,11 +163,11 @@ impl Resident {
 impl Spare for Mutex<Resident> {
     fn drop_all(&self) {
         let dropped = std::mem::take(&mut *lock(self));
-        tracing::debug!(bytes = dropped.bytes, "photographs on the device give way");
+        tracing::debug!(bytes = dropped.bytes, "photographs on the device are dropped to free memory");
     }
 }
 
-/// Threads that read, decode and reduce photographs before they are asked for.
+/// Threads that read, decode and downscale photographs before they are needed.
 struct Ahead {
     shared: Arc<SharedQueue>,
     threads: Vec<JoinHandle<()>>,
@@ -178,7 +181,7 @@ struct SharedQueue {
 #[derive(Default)]
 struct Queue {
     waiting: VecDeque<Key>,
-    /// What was asked for; `None` until it is there.
+    /// The announced photographs; `None` until fetched.
     fetched: HashMap<Key, Option<Result<Arc<PackedImage>>>>,
     stopped: bool,
 }
@@ -194,7 +197,7 @@ impl SharedQueue {
 }
 
 impl Ahead {
-    /// With as many threads as the system gives; `None` where there are none.
+    /// Starts as many of the threads as the system allows; `None` if there are none.
     fn new(views: &Arc<dyn ViewSource>, threads: u32) -> Option<Self> {
         let shared = Arc::new(SharedQueue { queue: Mutex::default(), changed: Condvar::new() });
         let mut ahead = Self { shared, threads: Vec::new() };
@@ -205,7 +208,7 @@ impl Ahead {
             match thread {
                 Ok(thread) => ahead.threads.push(thread),
                 Err(error) => {
-                    tracing::warn!(%error, "no thread to read photographs ahead; the run waits for some of them");
+                    tracing::warn!(%error, "cannot start another thread to prefetch photographs; training may wait for them");
                     break;
                 }
             }
@@ -222,7 +225,7 @@ impl Ahead {
         }
     }
 
-    /// Waits for what was expected; `None` where it was not, or no thread has begun with it.
+    /// Waits for an announced photograph; `None` if it was not announced or no thread has started on it.
     fn wait(&self, key: Key) -> Option<Result<Arc<PackedImage>>> {
         let mut queue = self.shared.lock();
         if queue.waiting.contains(&key) {
@@ -244,14 +247,14 @@ impl Drop for Ahead {
         self.shared.lock().stopped = true;
         self.shared.changed.notify_all();
         for thread in self.threads.drain(..) {
-            // A thread that panicked has nothing left to say.
+            // A thread that panicked has no result.
             let _ = thread.join();
         }
     }
 }
 
 fn work(shared: &SharedQueue, views: &dyn ViewSource) {
-    /// Gives up what a thread has begun when it panics, so that nobody waits for it.
+    /// Removes the photograph of a thread that panics, so that no caller waits for it.
     struct Begun<'a>(&'a SharedQueue, Key);
     impl Drop for Begun<'_> {
         fn drop(&mut self) {
@@ -291,7 +294,7 @@ mod tests {
     use crate::scene::{PinholeCamera, Pose};
     use crate::views::Weighted;
 
-    /// Pictures of one pixel that hold their index; every seventh cannot be read.
+    /// Images of one pixel that holds their index; every seventh cannot be read.
     #[derive(Default)]
     struct Numbers {
         loads: AtomicUsize,
@@ -313,7 +316,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_expected_is_read_once_and_faults_come_with_the_photograph_that_has_them() {
+    fn photographs_are_read_once_and_errors_stay_with_theirs() {
         for threads in [1, 2, 5] {
             let numbers = Arc::new(Numbers::default());
             let views: Arc<dyn ViewSource> = Arc::clone(&numbers) as Arc<dyn ViewSource>;
@@ -333,13 +336,13 @@ mod tests {
     }
 
     #[test]
-    fn a_thread_that_panics_keeps_nobody_waiting() {
+    fn a_thread_that_panics_blocks_no_caller() {
         let views: Arc<dyn ViewSource> = Arc::new(Numbers::default());
         let ahead = Ahead::new(&views, 1).unwrap();
         ahead.expect((99, 0));
-        // Begun, or taken back because nobody had begun: both end without a picture.
+        // Either the thread has started, or the request is withdrawn: both end without an image.
         assert!(ahead.wait((99, 0)).is_none());
-        // The thread may be gone: then the caller reads the next one.
+        // The thread may be gone; then the caller reads the next photograph.
         ahead.expect((5, 0));
         assert!(ahead.wait((5, 0)).is_none_or(|image| image.is_ok()));
     }
@@ -369,7 +372,7 @@ mod tests {
     }
 
     #[test]
-    fn views_come_as_often_as_their_weights_say() {
+    fn views_appear_in_proportion_to_their_weights() {
         let weights = [0.5, 1.0, 1.0, 2.0, 0.25, 0.3, 0.7];
         let mut truth = weighted(&weights);
         let (epochs, sum) = (400, weights.iter().sum::<f32>());
@@ -380,18 +383,26 @@ mod tests {
             for (view, weight) in weights.iter().enumerate() {
                 let share = 7.0 * weight / sum;
                 let even = [share.floor() as u32, share.ceil() as u32];
-                assert!(even.contains(&now[view]), "view {view} came {} times in epoch {epoch}", now[view]);
+                assert!(
+                    even.contains(&now[view]),
+                    "view {view} appeared {} times in epoch {epoch}",
+                    now[view]
+                );
                 seen[view] += now[view];
             }
         }
         for (view, weight) in weights.iter().enumerate() {
-            // Each epoch rounds up with the right probability: five deviations of the mean of a coin.
+            // Each epoch rounds up with the right probability: five standard deviations of the mean of a
+            // coin.
             let (share, found) = (7.0 * weight / sum, seen[view] as f32 / epochs as f32);
             let tolerance = 5.0 * 0.5 / (epochs as f32).sqrt();
-            assert!((found - share).abs() < tolerance, "view {view}: {found} an epoch, not {share}");
+            assert!((found - share).abs() < tolerance, "view {view}: {found} per epoch, not {share}");
         }
         let [mut once, mut again] = [(); 2].map(|()| weighted(&weights));
-        assert!((0..70).all(|at| once.view_at(at) == again.view_at(at)), "another order in another run");
+        assert!(
+            (0..70).all(|at| once.view_at(at) == again.view_at(at)),
+            "the order differs between two runs"
+        );
     }
 
     #[test]
@@ -404,14 +415,14 @@ mod tests {
     }
 
     #[test]
-    fn weights_that_say_nothing_are_refused() {
+    fn invalid_weights_are_refused() {
         for weights in [vec![1.0; 2], vec![1.0, 0.0, 1.0], vec![1.0, f32::NAN, 1.0]] {
             assert!(Weighted::new(many(3), weights.clone()).is_err(), "{weights:?}");
         }
     }
 
     #[test]
-    fn every_view_comes_once_an_epoch() {
+    fn every_view_appears_once_per_epoch() {
         let mut truth = TargetImages::new(many(10), 3, 0);
         let epoch = |truth: &mut TargetImages, first: u32| -> Vec<usize> {
             (first..first + 10).map(|iteration| truth.view_at(iteration)).collect()
@@ -423,6 +434,6 @@ mod tests {
             assert!(sorted.into_iter().eq(0..10));
         }
         assert_ne!(orders[0], orders[1]);
-        assert_eq!(orders[0], orders[3], "the same whatever was asked for between");
+        assert_eq!(orders[0], orders[3], "the order does not depend on the epochs in between");
     }
 }

@@ -1,11 +1,12 @@
 //! Adaptive density control of 3DGS (Kerbl et al. 2023, section 5, and their code) under a hard cap.
 //!
-//! Where the mean gradient by the projected centre is large, detail is missing: small Gaussians are cloned,
-//! large ones split. Transparent ones are removed, and once opacities were reset those of a size that no
-//! surface needs. Where 3DGS would pass the cap, those with the largest gradient come first. A child takes
-//! the place of a Gaussian that is removed, in order, then of a new entry at the end; where more are removed
-//! than added, the last ones move into the gaps with their moments, so that entries stay without gaps and no
-//! order depends on anything but indices. How this differs from 3DGS is said at [`ClassicConfig`].
+//! Where the mean gradient w.r.t. the projected centre is large, detail is missing: small Gaussians are
+//! cloned and large ones are split. Transparent Gaussians are removed, and after the first reset of opacities
+//! also oversized ones. If 3DGS would exceed the cap, the Gaussians with the largest gradients come first.
+//!
+//! A child takes the entry of a removed Gaussian, in order, or else a new entry at the end. If more are
+//! removed than added, the last Gaussians move into the gaps with their moments. So entries have no gaps, and
+//! every order depends only on indices. [`ClassicConfig`] lists the differences from 3DGS.
 
 use super::{CHUNK, Stats};
 use crate::Result;
@@ -13,23 +14,23 @@ use crate::config::{ClassicConfig, Moments};
 use crate::gpu::{Recorder, Size, sh_stride};
 use crate::train::Trainer;
 
-/// A parent and where its child goes.
+/// A parent and the entry of its child.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 struct Child {
     parent: u32,
     place: u32,
-    /// Split in two; else cloned.
+    /// True: split in two; false: cloned.
     split: bool,
 }
 
-/// What is done with all Gaussians at one iteration: children first, then moves.
+/// All changes at one iteration: children first, then moves.
 #[derive(Clone, Debug, Default, PartialEq)]
 struct Decision {
     /// Parents ascending, places ascending.
     children: Vec<Child>,
     /// (from, to): from beyond `count` to below it, both ascending.
     moves: Vec<(u32, u32)>,
-    /// Gaussians afterwards.
+    /// Number of Gaussians afterwards.
     count: u32,
 }
 
@@ -37,7 +38,7 @@ impl Trainer {
     pub(super) fn densify_classic(&mut self, stats: &[Stats]) -> Result<()> {
         let limits = Limits::new(&self.config.classic, self.extent, self.schedule.was_reset(self.iteration));
         let decision = decide(stats, &limits, self.config.max_gaussians as usize);
-        // Children and moves need the entries of before and of after.
+        // Children and moves need both the old and the new entries.
         let most = stats.len().max(decision.count as usize);
         self.blocks.set_trainable_total(&self.gpu, most as u32);
         for chunk in decision.children.chunks(CHUNK) {
@@ -80,7 +81,7 @@ impl Trainer {
         self.finish("adding Gaussians")
     }
 
-    /// Copies entries with all that training keeps of them.
+    /// Copies entries with all their training state.
     fn move_entries(&self, moves: &[(u32, u32)]) -> Result<()> {
         let (from, to): (Vec<u32>, Vec<u32>) = moves.iter().copied().unzip();
         let stride = sh_stride(self.config.sh_degree);
@@ -113,12 +114,12 @@ impl Trainer {
         Ok(())
     }
 
-    /// Lowers all opacities to 0.01 at most.
+    /// Lowers all opacities to at most 0.01.
     pub(super) fn reset_opacities(&self) -> Result<()> {
         let mut recorder = Recorder::new(&self.gpu);
         for (_, block, training) in self.blocks.trainable() {
-            // Words of a row of moments, and those of the opacity: first and second moment in one, or each
-            // its own.
+            // Words per row of moments, and the words of the opacity: first and second moment share one word
+            // or have one each.
             let words = match training.kind() {
                 Moments::Compact => [16_u32, 3, 3, 0],
                 Moments::F32 => [24, 3, 15, 0],
@@ -167,7 +168,7 @@ impl Limits {
         stats.scale > self.clone_scale
     }
 
-    /// 3DGS divides first and then removes; what would be removed with its children is not divided here.
+    /// 3DGS divides first and then removes. Here a Gaussian whose children would be removed is not divided.
     fn keeps(&self, stats: &Stats) -> bool {
         let shrinks = self.divides(stats) && self.splits(stats);
         let scale = if shrinks { stats.scale / 1.6 } else { stats.scale };
@@ -175,11 +176,12 @@ impl Limits {
     }
 }
 
-/// Which Gaussians are cloned, split and removed so that there are at most `cap`, and where everything goes.
+/// Decides which Gaussians are cloned, split and removed to stay within `cap`, and the entries of all
+/// results.
 fn decide(stats: &[Stats], limits: &Limits, cap: usize) -> Decision {
     let mut kept: Vec<bool> = stats.iter().map(|s| limits.keeps(s)).collect();
     if !kept.contains(&true) {
-        // A run without Gaussians could not go on: the most opaque one stays.
+        // A run cannot continue without Gaussians: the most opaque one stays.
         let order = |a: &usize, b: &usize| stats[*a].opacity.total_cmp(&stats[*b].opacity).then(b.cmp(a));
         let Some(last) = (0..stats.len()).max_by(order) else { return Decision::default() };
         kept[last] = true;
@@ -193,7 +195,7 @@ fn decide(stats: &[Stats], limits: &Limits, cap: usize) -> Decision {
     parents.sort_unstable();
 
     let count = left + parents.len();
-    // Gaps, then new entries; those that are left over below `count` are filled from beyond it.
+    // Gaps, then new entries. Gaps below `count` that remain are filled from beyond it.
     let mut places = (0..count).filter(|&i| i >= stats.len() || !kept[i]).map(|i| i as u32);
     let children = parents
         .into_iter()
@@ -216,7 +218,7 @@ mod tests {
         Stats { opacity, gradient, scale, pixel_gradient: 0.0 }
     }
 
-    /// Carries a decision out on names: parents give their children their own name.
+    /// Carries out a decision on names: a child has the name of its parent.
     fn carried_out(n: u32, decision: &Decision) -> Vec<u32> {
         let mut names: Vec<u32> = (0..n).collect();
         names.resize(names.len().max(decision.count as usize), u32::MAX);
@@ -231,22 +233,22 @@ mod tests {
     }
 
     #[test]
-    fn small_ones_are_cloned_large_ones_split_and_transparent_or_huge_ones_removed() {
+    fn small_are_cloned_large_split_transparent_or_huge_removed() {
         let all = [
             stats(0.5, 1.0, 1.0),      // at the threshold and small
             stats(0.5, 0.99, 1.0),     // below the threshold
             stats(0.5, 2.0, 1.01),     // large
             stats(0.0049, 5.0, 1.0),   // transparent
             stats(0.5, 0.0, 10.5),     // huge
-            stats(0.5, 3.0, 15.9),     // huge, but not in halves
-            stats(0.5, 3.0, 16.1),     // huge even in halves
+            stats(0.5, 3.0, 15.9),     // huge, but its halves are not
+            stats(0.5, 3.0, 16.1),     // huge, and so are its halves
             stats(0.5, f32::NAN, 1.0), // no gradient
         ];
         let decision = decide(&all, &LIMITS, 100);
         let child = |parent, place, split| Child { parent, place, split };
         assert_eq!(decision.children, [child(0, 3, false), child(2, 4, true), child(5, 6, true)]);
         assert_eq!((decision.moves.len(), decision.count), (0, 8));
-        // Before the first reset size does not matter.
+        // Size does not matter before the first reset.
         let early = Limits { prune_scale: f32::INFINITY, ..LIMITS };
         let decision = decide(&all, &early, 100);
         assert_eq!(decision.count, 7 + 4);
@@ -254,7 +256,7 @@ mod tests {
     }
 
     #[test]
-    fn the_cap_leaves_the_largest_gradients_and_among_equals_the_first() {
+    fn under_the_cap_the_largest_gradients_are_divided_first() {
         let all: Vec<Stats> = (0..10).map(|i| stats(0.5, [2.0, 3.0][i % 2], 0.5)).collect();
         for (cap, parents) in [
             (9, vec![]),
@@ -270,7 +272,7 @@ mod tests {
     }
 
     #[test]
-    fn gaps_are_closed_and_nobody_is_lost() {
+    fn gaps_are_closed_and_no_gaussian_is_lost() {
         for seed in 0..40 {
             let u = |i, k| uniform_at(seed, Stream::Test, i, k);
             let n = 1 + seed * 7;
@@ -293,7 +295,7 @@ mod tests {
             expected.sort_unstable();
             assert_eq!(names, expected, "seed {seed}");
             assert!(decision.count <= n + n / 8);
-            // Each place is written once, and none that is read later.
+            // Each entry is written once, and no entry that is read later is written.
             let reads = decision.children.iter().map(|c| c.parent).chain(decision.moves.iter().map(|m| m.0));
             let writes = decision.children.iter().map(|c| c.place).chain(decision.moves.iter().map(|m| m.1));
             let writes: std::collections::BTreeSet<u32> = writes.collect();
@@ -312,7 +314,7 @@ mod tests {
     }
 
     #[test]
-    fn lengths_are_shares_of_the_extent_and_size_counts_after_a_reset() {
+    fn limits_scale_with_the_extent_and_size_counts_after_a_reset() {
         let config = ClassicConfig::default();
         let limits = Limits::new(&config, 50.0, true);
         assert_eq!((limits.clone_scale, limits.prune_scale), (0.5, 5.0));

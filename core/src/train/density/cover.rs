@@ -1,9 +1,9 @@
-//! Covers surfaces that have become bare when density is decided for the last time: Gaussians that have faded
-//! go there, new ones as far as there is room for more, then the faintest.
+//! Covers bare surfaces at the last density decision. Faded Gaussians move there first, then new ones are
+//! added as far as there is room, then the faintest Gaussians are moved.
 //!
-//! Earlier it would not last: what is put there is soon pulled small and faint again, for the photographs
-//! hardly hold it, and keeps a bare place from being found. After the last decision nothing pulls
-//! (`TrainConfig::opacity_reg`).
+//! Earlier, this would not last. The photographs hardly constrain such a Gaussian, so it soon becomes small
+//! and faint again, and it prevents the bare place from being found. After the last decision nothing pulls on
+//! it (`TrainConfig::opacity_reg`).
 
 use super::mcmc::is_faded;
 use super::{CHUNK, Stats};
@@ -12,12 +12,12 @@ use crate::config::Strategy;
 use crate::gpu::Recorder;
 use crate::train::Trainer;
 
-/// Below this opacity a Gaussian gives way to one that covers a surface.
+/// Below this opacity a Gaussian may be replaced by one that covers a surface.
 const FAINT: f32 = 0.1;
 
 impl Trainer {
-    /// Puts a Gaussian at each place that must be covered and is not, the barest first, where this is the
-    /// last decision; `stats` are those of all afterwards.
+    /// At the last decision, puts a Gaussian at each bare place, the barest first. Updates `stats` to include
+    /// them.
     pub(super) fn cover_surfaces(&mut self, stats: &mut Vec<Stats>) -> Result<()> {
         let (Some(surfaces), Some(medium)) = (&self.surfaces, self.appearances.water()) else {
             return Ok(());
@@ -34,11 +34,7 @@ impl Trainer {
         gone.for_each(|(_, transform)| transform[0][3] = f32::NEG_INFINITY);
         let bare = surfaces.bare(&trained, medium.run().least_cover());
         let places = places(stats, target, bare.len());
-        tracing::info!(
-            bare = bare.len(),
-            covered = places.len(),
-            "surfaces that had become bare are covered"
-        );
+        tracing::info!(bare = bare.len(), covered = places.len(), "bare surfaces are covered");
         let (points, places): (Vec<u32>, Vec<u32>) = bare.into_iter().zip(places).unzip();
         let Some(last) = places.iter().max() else { return Ok(()) };
         stats.resize(stats.len().max(*last as usize + 1), Stats::default());
@@ -51,14 +47,13 @@ impl Trainer {
             recorder.submit();
             self.finish("covering surfaces")?;
         }
-        // Neither faded, nor split before anything was seen of it.
+        // The new Gaussian is not faded, and is not split before any view has seen it.
         places.iter().for_each(|&at| stats[at as usize] = Stats { opacity: 1.0, ..Stats::default() });
         Ok(())
     }
 }
 
-/// Where `count` Gaussians that cover surfaces go: to faded ones, to new entries up to `target`, then to the
-/// faintest.
+/// Entries for `count` covering Gaussians: faded ones, then new entries up to `target`, then the faintest.
 fn places(stats: &[Stats], target: u32, count: usize) -> Vec<u32> {
     let opacity = |at: u32| stats[at as usize].opacity;
     let (faded, alive): (Vec<u32>, Vec<u32>) = (0..stats.len() as u32).partition(|&at| is_faded(opacity(at)));
@@ -74,11 +69,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn faded_gaussians_go_first_then_new_ones_then_the_faintest_and_no_other() {
+    fn places_are_faded_ones_then_new_ones_then_the_faintest() {
         let stats: Vec<Stats> = [0.5, 0.004, 0.09, 0.9, 0.0, 0.02, 0.11]
             .map(|opacity| Stats { opacity, ..Stats::default() })
             .to_vec();
-        assert_eq!(places(&stats, 9, 9), [1, 4, 7, 8, 5, 2], "what shows something stays");
+        assert_eq!(places(&stats, 9, 9), [1, 4, 7, 8, 5, 2], "visible Gaussians stay");
         assert_eq!(places(&stats, 9, 3), [1, 4, 7]);
         assert_eq!(places(&stats, 7, 3), [1, 4, 5], "no room for more");
         assert!(places(&stats, 9, 0).is_empty());

@@ -1,10 +1,10 @@
 //! Relocation under a cap: faded Gaussians move to where detail is missing, and new ones are added there, up
 //! to a cap.
 //!
-//! In the spirit of 3DGS-MCMC (Kheradmand et al. 2024: relocation under a hard cap) with the measure of AbsGS
-//! (Ye et al. 2024): the sum of absolute pixel gradients of a Gaussian, as a mean over the views that saw it,
-//! so that views that do not see it do not dilute it. Sources are drawn without replacement with that weight
-//! (Efraimidis and Spirakis 2006), from random numbers that are a function of (seed, iteration, index).
+//! This combines the relocation under a hard cap of 3DGS-MCMC (Kheradmand et al. 2024) with the measure of
+//! AbsGS (Ye et al. 2024). The measure is the sum of absolute pixel gradients of a Gaussian, averaged over
+//! the views that saw it, so that other views do not dilute it. Sources are drawn without replacement with
+//! that weight (Efraimidis and Spirakis 2006). The random numbers are a function of (seed, iteration, index).
 
 use super::{CHUNK, Stats};
 use crate::Result;
@@ -21,7 +21,7 @@ pub(super) fn is_faded(opacity: f32) -> bool {
 }
 
 impl Trainer {
-    /// Relocates and adds Gaussians by the schedule.
+    /// Relocates and adds Gaussians according to the schedule.
     pub(super) fn densify_mcmc(&mut self, stats: &[Stats]) -> Result<()> {
         let target = self.schedule.target_count(self.iteration, self.initial) as usize;
         let moves = decide(stats, target, self.config.seed, self.iteration);
@@ -64,9 +64,10 @@ impl Trainer {
     }
 }
 
-/// Which Gaussian is split and where its second child goes: (source, destination), sources ascending.
+/// Pairs of (Gaussian to split, entry of its second child), ascending by the first.
 ///
-/// Weights are pixel gradients. Destinations are the faded ones in order, then new entries up to `target`.
+/// Weights are pixel gradients. Destinations are the faded Gaussians in order, then new entries up to
+/// `target`.
 fn decide(stats: &[Stats], target: usize, seed: u32, iteration: u32) -> Vec<(u32, u32)> {
     let mut destinations: Vec<u32> =
         stats.iter().enumerate().filter(|(_, s)| is_faded(s.opacity)).map(|(i, _)| i as u32).collect();
@@ -108,7 +109,7 @@ mod tests {
     }
 
     #[test]
-    fn faded_gaussians_are_refilled_first_and_the_target_is_kept() {
+    fn faded_gaussians_are_replaced_first_and_the_target_is_met() {
         let stats = stats(1000);
         let moves = decide(&stats, 1300, 1, 100);
         let destinations: Vec<u32> = moves.iter().map(|m| m.1).collect();
@@ -126,7 +127,7 @@ mod tests {
     }
 
     #[test]
-    fn heavier_gaussians_are_split_more_often_and_the_draw_depends_on_its_key_only() {
+    fn splits_follow_the_weights_and_depend_only_on_the_key() {
         let stats = stats(7000);
         let moves = decide(&stats, 7000, 3, 50);
         assert_eq!(moves, decide(&stats, 7000, 3, 50));

@@ -1,8 +1,8 @@
-//! Density control: where Gaussians are added, moved and removed, at fixed iterations.
+//! Density control: adds, moves and removes Gaussians at fixed iterations.
 //!
-//! The host reads back four numbers a Gaussian, a pure function of them and of random numbers keyed by (seed,
-//! iteration, index) decides, and kernels carry it out; so a strategy has no state of its own, and a resumed
-//! run decides alike.
+//! The host reads back four numbers per Gaussian. A pure function of them and of random numbers keyed by
+//! (seed, iteration, index) decides, and kernels carry the decision out. So a strategy has no state of its
+//! own, and a resumed run decides the same.
 
 mod classic;
 mod cover;
@@ -15,10 +15,10 @@ use crate::config::Strategy;
 use crate::gpu::{BLOCK_CAPACITY, Block, BlockTraining, Recorder, Size, sh_stride};
 use crate::{CoreError, Result};
 
-/// Most Gaussians that are split or moved between two submissions: bounds the staging buffer.
+/// Largest number of Gaussians split or moved between two submissions: bounds the staging buffer.
 const CHUNK: usize = 65_536;
 
-/// What is known of a trainable Gaussian, by `density_stats.wgsl`.
+/// Statistics of a trainable Gaussian, from `density_stats.wgsl`.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
 struct Stats {
@@ -26,17 +26,17 @@ struct Stats {
     opacity: f32,
     /// Sum of absolute pixel gradients, mean over views (AbsGS).
     pixel_gradient: f32,
-    /// Length of the gradient by the centre in units of half a picture, mean over views (3DGS).
+    /// Length of the gradient w.r.t. the centre in units of half an image, mean over views (3DGS).
     gradient: f32,
-    /// Largest deviation, scene units.
+    /// Largest standard deviation, scene units.
     scale: f32,
 }
 
 /// Counts Gaussians larger than `largest` (scene units) as faded, so that they are relocated or removed.
 ///
-/// A hole in a surface under water shows what lies behind it, and the loss cannot tell open water from one
-/// Gaussian behind the whole scene: that one closes every hole, with a colour and a range that have nothing
-/// to do with the surface.
+/// Through a hole in an underwater surface one sees what lies behind it. The loss cannot distinguish open
+/// water from a single Gaussian behind the whole scene. Such a Gaussian closes every hole, with a colour and
+/// a range that are unrelated to the surface.
 fn fade_oversized(stats: &mut [Stats], largest: f32) {
     for one in stats.iter_mut().filter(|one| one.scale > largest) {
         one.opacity = 0.0;
@@ -44,7 +44,7 @@ fn fade_oversized(stats: &mut [Stats], largest: f32) {
 }
 
 impl Trainer {
-    /// Does what is due at this iteration; the device is idle before and after.
+    /// Runs the density steps that are due at this iteration; the device is idle before and after.
     pub(super) fn densify(&mut self) -> Result<()> {
         if self.schedule.densifies_at(self.iteration) {
             let mut stats = self.read_stats()?;
@@ -64,7 +64,7 @@ impl Trainer {
         Ok(())
     }
 
-    /// Statistics of every trainable Gaussian; the sums start anew.
+    /// Reads the statistics of every trainable Gaussian and resets the sums.
     fn read_stats(&self) -> Result<Vec<Stats>> {
         let mut stats = Vec::new();
         for (_, block, training) in self.blocks.trainable() {
@@ -90,13 +90,13 @@ impl Trainer {
         Ok(stats)
     }
 
-    /// Room for `count` Gaussians between two blocks: transforms and coefficients.
+    /// A staging buffer for `count` Gaussians: transforms and coefficients.
     fn staged(&self, count: usize) -> Result<wgpu::Buffer> {
         let row = u64::from(3 + sh_stride(self.config.sh_degree)) * 16;
         self.gpu.buffer("staged Gaussians", count as u64 * row)
     }
 
-    /// Writes staged Gaussians to entries, the n-th of `places` from row n.
+    /// Writes staged Gaussians to entries: row n to the n-th of `places`.
     fn place(&self, recorder: &mut Recorder<'_>, staged: &wgpu::Buffer, places: &[u32]) -> Result<()> {
         self.by_block(places, |block, _, rows| {
             let buffer = self.gpu.buffer("densify rows", rows.len() as u64 * 8)?;
@@ -117,8 +117,8 @@ impl Trainer {
         })
     }
 
-    /// Calls `act` for each trainable block with those of `indices` that lie in it: (entry of the block,
-    /// position among `indices`), in their order; not for blocks without any.
+    /// Calls `act` for each trainable block that contains any of `indices`, with their (entry of the block,
+    /// position in `indices`), in their order.
     fn by_block(
         &self,
         indices: &[u32],
@@ -139,7 +139,7 @@ impl Trainer {
         Ok(())
     }
 
-    /// Waits for the device; `what` is what it was about.
+    /// Waits for the device; `what` names the operation in errors.
     fn finish(&self, what: &str) -> Result<()> {
         self.gpu.release_unused().map_err(|error| match error {
             CoreError::Gpu(message) => CoreError::Gpu(format!("{what}: {message}")),
@@ -153,7 +153,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_gaussian_larger_than_allowed_counts_as_faded_and_no_other_does() {
+    fn only_gaussians_beyond_the_size_limit_count_as_faded() {
         let one = |scale| Stats { opacity: 0.9, scale, ..Stats::default() };
         let mut stats = [one(3.9), one(4.0), one(4.1), one(f32::INFINITY)];
         fade_oversized(&mut stats, 4.0);

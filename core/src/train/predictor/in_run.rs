@@ -1,9 +1,8 @@
-//! What a run does with WaterParamPredict: when it is asked, what it is shown, and how its word becomes the
-//! water.
+//! How a run uses WaterParamPredict: when it predicts, from what, and how the prediction becomes the water.
 
 use std::sync::Arc;
 
-use super::{Said, Seen};
+use super::{Prediction, Seen};
 use crate::Result;
 use crate::config::NetworkConfig;
 use crate::gpu::{FrameUniform, Gpu, Recorder};
@@ -12,28 +11,28 @@ use crate::train::start::able_to_move;
 use crate::train::{Gathered, Trainer};
 use crate::water::Water;
 
-/// Most views that are asked at the end: as many say how much they differ.
+/// Largest number of views to predict for at the end: enough to measure their spread.
 const MOST_VIEWS: usize = 64;
 
-/// A prediction for the view of the iteration that is being recorded.
+/// The prediction for the view of the iteration being recorded.
 pub(in crate::train) struct AtOnce {
     seen: Seen,
     depth: DepthMap,
 }
 
 impl Trainer {
-    /// First iteration after the one that is next at whose start the network has something to do.
+    /// First iteration after the next one at whose start the network has work to do.
     pub(in crate::train) fn next_prediction(&self) -> u32 {
         self.predictor.as_ref().map_or(u32::MAX, |predictor| predictor.next_due(self.iteration))
     }
 
-    /// Does what of the network is due at this iteration; the device is idle before.
+    /// Runs the work of the network that is due at this iteration; the device is idle before.
     pub(in crate::train) fn predict_water(&mut self) -> Result<()> {
         let Some(predictor) = &self.predictor else { return Ok(()) };
         if self.iteration >= predictor.end { self.decide_water() } else { self.exchange_with_network() }
     }
 
-    /// What is between two predictions.
+    /// The work between two predictions.
     fn exchange_with_network(&mut self) -> Result<()> {
         let gpu = Arc::clone(&self.gpu);
         let key = self.view_of(self.iteration - 1);
@@ -42,48 +41,48 @@ impl Trainer {
             return Ok(());
         };
         let learned = predictor.used.clone().zip(usable(medium.take_gathered(&gpu)?));
-        // Where it said nothing usable the water stays, and with it the view that it was made of.
-        if let Some(Said { depth, raw: Some(raw), .. }) = predictor.take_said()? {
+        // Without a finite prediction, the water stays, and with it the view that it was predicted from.
+        if let Some(Prediction { depth, raw: Some(raw), .. }) = predictor.take_prediction()? {
             medium.set_raw(&gpu, &self.frame, raw);
             predictor.used = Some(depth);
         }
         predictor.start(learned, seen)
     }
 
-    /// Makes one water for the run of what the network says of the views; descent begins anew from there.
+    /// Sets the water of the run to the mean prediction over the views. Gradient descent restarts from there.
     fn decide_water(&mut self) -> Result<()> {
         let gpu = Arc::clone(&self.gpu);
         let (Some(predictor), Some(medium)) = (&mut self.predictor, self.appearances.water()) else {
             return Ok(());
         };
         let gathered = usable(medium.take_gathered(&gpu)?);
-        // Comes too late to enter; what it has learnt counts.
-        predictor.take_said()?;
+        // The prediction comes too late to be used, but the learning step counts.
+        predictor.take_prediction()?;
         if let Some((depth, v_raw)) = predictor.used.take().zip(gathered) {
             predictor.learn(&depth, v_raw, false);
         }
         let count = self.targets.views().len();
         let asked = count.min(MOST_VIEWS);
-        let mut said = Vec::with_capacity(asked);
+        let mut predictions = Vec::with_capacity(asked);
         for view in (0..asked).map(|i| i * count / asked) {
             let seen = self.look(view)?;
             let Some(predictor) = &mut self.predictor else { return Ok(()) };
             let depth = predictor.depth_map(&seen)?;
             if let Some(raw) = predictor.predict(&depth) {
-                said.push((f64::from(depth.coverage()), raw.map(f64::from)));
+                predictions.push((f64::from(depth.coverage()), raw.map(f64::from)));
             }
         }
         let (Some(predictor), Some(medium)) = (&mut self.predictor, self.appearances.water_mut()) else {
             return Ok(());
         };
-        let (water, spread) = match mean_and_deviation(&said) {
+        let (water, spread) = match mean_and_deviation(&predictions) {
             Some((mean, deviation)) => {
                 let water = able_to_move(Water::from_raw(mean, predictor.unit), predictor.unit);
                 (water, constrained(&water, deviation, predictor.unit))
             }
             None => (medium.water(&gpu, &self.frame)?, [f64::INFINITY; 9]),
         };
-        predictor.report(&water, &spread, said.len());
+        predictor.report(&water, &spread, predictions.len());
         let raw = water.to_raw(predictor.unit).map(|value| value as f32);
         let standard_error = predictor.errors_of(&water, spread);
         medium.begin_at(&gpu, &self.frame, raw, standard_error);
@@ -91,7 +90,7 @@ impl Trainer {
         Ok(())
     }
 
-    /// Renders the ranges of a training view at the size of now.
+    /// Renders the ranges of a training view at the current size.
     fn look(&mut self, view: usize) -> Result<Seen> {
         let gpu = Arc::clone(&self.gpu);
         let TrainViewAt { camera, pose, key } = self.view_at_size(view);
@@ -115,7 +114,7 @@ impl Trainer {
         }
     }
 
-    /// Camera and pose of a view at the size that the next iteration, or the last, has it.
+    /// Camera and pose of a view at its size in the next iteration, or in the last one.
     fn view_at_size(&self, index: usize) -> TrainViewAt {
         let view = &self.targets.views()[index];
         let progress = self.schedule.progress(self.iteration.min(self.config.iterations - 1));
@@ -125,8 +124,8 @@ impl Trainer {
         TrainViewAt { camera, pose: view.pose, key: (index, level) }
     }
 
-    /// Ranges and alpha of the view that was rendered last, which has `size`. Waits for the device, and
-    /// copies 20 bytes a pixel: in the first quarter of a run pictures are at half size or less.
+    /// Reads ranges and alpha of the view that was rendered last, of the given `size`. Waits for the device
+    /// and copies 20 bytes per pixel. In the first quarter of a run, images have half size or less.
     fn read_seen(&self, size: [u32; 2]) -> Result<Seen> {
         let (targets, pixels) = (self.frame.targets()?, size[0] as usize * size[1] as usize);
         let ranges = self.gpu.read(&targets.range_image, 0, pixels)?;
@@ -134,8 +133,8 @@ impl Trainer {
         Ok(Seen { size, ranges, alphas: image.iter().map(|pixel| pixel[3]).collect() })
     }
 
-    /// Puts the water that the network predicts for the view of `size` that was blended in place; `None`
-    /// where it says nothing usable, and the water stays.
+    /// Sets the water to the prediction for the view that was just blended, of the given `size`. `None` if
+    /// the prediction is not finite; the water then stays.
     pub(in crate::train) fn predict_at_once(&mut self, gpu: &Gpu, size: [u32; 2]) -> Result<Option<AtOnce>> {
         let seen = self.read_seen(size)?;
         let (Some(predictor), Some(medium)) = (&mut self.predictor, self.appearances.water()) else {
@@ -147,8 +146,9 @@ impl Trainer {
         Ok(Some(AtOnce { seen, depth }))
     }
 
-    /// Takes the step of learning for what [`Trainer::predict_at_once`] gave, after the way back through the
-    /// water was recorded, and where the depth map has a gradient adds it to those by alpha and by range.
+    /// Takes the learning step for the prediction of [`Trainer::predict_at_once`], after the backward pass
+    /// through the water was recorded. If the depth map has a gradient, adds it to the gradients with respect
+    /// to alpha and range.
     pub(in crate::train) fn learn_at_once(
         &mut self,
         gpu: &Gpu,
@@ -185,25 +185,25 @@ struct TrainViewAt {
     key: (usize, u32),
 }
 
-/// Sums that there is something in.
+/// The gradient sums, if any iteration contributed to them.
 fn usable(gathered: Gathered) -> Option<[f32; 9]> {
     (gathered.iterations > 0).then_some(gathered.v_raw)
 }
 
-/// Weighted mean and standard deviation of nine numbers over views; `None` where there are none. Views that
-/// show nothing have no weight, unless all do.
-fn mean_and_deviation(said: &[(f64, [f64; 9])]) -> Option<([f64; 9], [f64; 9])> {
-    let total: f64 = said.iter().map(|(weight, _)| weight).sum();
-    let weight = |own: f64| if total > 0.0 { own / total } else { 1.0 / said.len() as f64 };
-    if said.is_empty() {
+/// Weighted mean and standard deviation of the raw water parameters over views; `None` without views. Views
+/// that show nothing have no weight, unless all do.
+fn mean_and_deviation(predictions: &[(f64, [f64; 9])]) -> Option<([f64; 9], [f64; 9])> {
+    let total: f64 = predictions.iter().map(|(weight, _)| weight).sum();
+    let weight = |own: f64| if total > 0.0 { own / total } else { 1.0 / predictions.len() as f64 };
+    if predictions.is_empty() {
         return None;
     }
     let mut mean = [0.0; 9];
-    for (own, raw) in said {
+    for (own, raw) in predictions {
         mean.iter_mut().zip(raw).for_each(|(mean, raw)| *mean += weight(*own) * raw);
     }
     let mut variance = [0.0; 9];
-    for (own, raw) in said {
+    for (own, raw) in predictions {
         for i in 0..9 {
             variance[i] += weight(*own) * (raw[i] - mean[i]).powi(2);
         }
@@ -211,7 +211,8 @@ fn mean_and_deviation(said: &[(f64, [f64; 9])]) -> Option<([f64; 9], [f64; 9])> 
     Some((mean, variance.map(f64::sqrt)))
 }
 
-/// Deviations of the nine numbers of `water` from those of its unconstrained numbers, by the slopes of eq. 8.
+/// Deviations of the parameters of `water` from those of its unconstrained parameters, by the slopes of
+/// eq. 8.
 fn constrained(water: &Water, deviation: [f64; 9], unit: f64) -> [f64; 9] {
     let slopes = water.slopes(unit);
     std::array::from_fn(|i| deviation[i] * slopes[i])
@@ -222,21 +223,21 @@ mod tests {
     use super::*;
 
     #[test]
-    fn views_count_by_what_they_show_and_their_spread_is_that_of_the_numbers() {
-        let said = [(0.75, [1.0; 9]), (0.25, [5.0; 9]), (0.0, [100.0; 9])];
-        let Some((mean, deviation)) = mean_and_deviation(&said) else { panic!("there are views") };
+    fn mean_and_deviation_weigh_views_by_their_coverage() {
+        let predictions = [(0.75, [1.0; 9]), (0.25, [5.0; 9]), (0.0, [100.0; 9])];
+        let Some((mean, deviation)) = mean_and_deviation(&predictions) else { panic!("there are views") };
         assert!(mean.iter().all(|value| (value - 2.0).abs() < 1e-12), "{mean:?}");
         // Root of 0.75 * 1 + 0.25 * 9.
         assert!(deviation.iter().all(|value| (value - 3.0_f64.sqrt()).abs() < 1e-12), "{deviation:?}");
         let Some((mean, _)) = mean_and_deviation(&[(0.0, [1.0; 9]), (0.0, [3.0; 9])]) else {
             panic!("there are views")
         };
-        assert_eq!(mean, [2.0; 9], "views that show nothing count alike");
+        assert_eq!(mean, [2.0; 9], "views that show nothing count equally");
         assert_eq!(mean_and_deviation(&[]), None);
     }
 
     #[test]
-    fn deviations_of_the_nine_numbers_are_those_of_the_unconstrained_ones_times_the_slope() {
+    fn deviations_are_those_of_raw_parameters_times_the_slopes() {
         let (unit, h) = (3.2, 1e-6);
         let raw = Water::COASTAL.to_raw(unit);
         let found = constrained(&Water::COASTAL, [h; 9], unit);
