@@ -8,7 +8,7 @@ use fathom_fuzz::{Folder, Target, run};
 
 use crate::client::safe_path;
 use crate::config_args::JobArgs;
-use crate::verbs::eval;
+use crate::eval_summary::summary;
 use crate::{model, output};
 
 #[global_allocator]
@@ -78,7 +78,7 @@ fn fuzzed_files_of_a_result_are_read_or_refused() {
 
     let read = |bytes: &[u8]| {
         let Ok(metrics) = output::read_json(&folder.put("metrics.json", bytes)) else { return false };
-        !eval::summary(&metrics).is_empty()
+        !summary(&metrics).is_empty()
     };
     let metrics = br#"{"psnr": 30.5, "ssim": 0.9, "lpips": null, "views": [{"name": "a.jpg", "psnr": 30, "ssim": null}],
 "gaussians": 1000, "water": {"beta_d": [0.1, 0.2, 0.3], "beta_b": [1, 2, 3], "b_inf": [0, 0.1, 1], "medium": "per_pixel",

@@ -4,18 +4,21 @@
 //! to stderr. A failure exits with 1 (2 for wrong usage, 130 for an interruption). Its message is one
 //! sentence: what happened, where, and what to do.
 
+mod against_truth;
 mod blob;
 mod children;
 mod client;
 mod config_args;
 mod dial_args;
 mod error;
+mod eval_summary;
 #[cfg(test)]
 mod fuzz;
 mod maps;
 mod model;
 mod open_water;
 mod output;
+mod photographs;
 mod progress;
 mod seams;
 mod settings;

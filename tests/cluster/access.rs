@@ -380,14 +380,14 @@ async fn workers_show_a_certificate_and_people_a_token_over_tls() {
         token: Some(Secret::new(&cluster.first_token())),
         ..Dial::to(&cluster.coordinator.url())
     };
-    let call = |dial: Dial| async move { Caller { line: dial.lazily().unwrap() }.list().await };
+    let call = |dial: Dial| async move { Caller { connection: dial.lazily().unwrap() }.list().await };
     assert!(call(operator.clone()).await.unwrap().is_empty());
     let plain = Dial { url: operator.url.replace("https", "http"), ..operator.clone() };
     assert!(call(plain).await.is_err(), "plain text was answered");
     let believes_another = Dial { tls_ca: Some(theirs.ca()), ..operator.clone() };
     assert!(call(believes_another).await.is_err(), "a server certificate of an unknown CA was accepted");
 
-    let caller = Caller { line: operator.lazily().unwrap() };
+    let caller = Caller { connection: operator.lazily().unwrap() };
     let request = IssueTokenRequest { name: "gpu".into(), role: Role::Worker.into(), ..Default::default() };
     let token = caller.admin().issue_token(request).await.unwrap().into_inner().secret;
     let dial = |tls_identity| Dial { token: Some(Secret::new(&token)), tls_identity, ..operator.clone() };
@@ -397,7 +397,7 @@ async fn workers_show_a_certificate_and_people_a_token_over_tls() {
             protocol_version: fathom_proto::WORKER_PROTOCOL_VERSION,
             ..Default::default()
         };
-        Caller { line: dial.lazily().unwrap() }.workers().register(request).await
+        Caller { connection: dial.lazily().unwrap() }.workers().register(request).await
     };
     assert!(register(dial(Some(worker))).await.is_ok());
     assert_eq!(said(register(dial(None)).await), is(Code::Unauthenticated, "CERTIFICATE_MISSING"));
@@ -434,17 +434,17 @@ async fn changed_certificates_are_reloaded_and_open_calls_continue() {
         token: Some(Secret::new(token)),
         ..Dial::to(&cluster.coordinator.url())
     };
-    let call = |dial: Dial| async move { Caller { line: dial.lazily().unwrap() }.list().await };
+    let call = |dial: Dial| async move { Caller { connection: dial.lazily().unwrap() }.list().await };
     let register = |dial: Dial| async move {
         let request = worker_v1::RegisterRequest {
             incarnation: INCARNATION.into(),
             protocol_version: fathom_proto::WORKER_PROTOCOL_VERSION,
             ..Default::default()
         };
-        Caller { line: dial.lazily().unwrap() }.workers().register(request).await
+        Caller { connection: dial.lazily().unwrap() }.workers().register(request).await
     };
     let operator = cluster.first_token();
-    let before = Caller { line: dial(&old, &operator).lazily().unwrap() };
+    let before = Caller { connection: dial(&old, &operator).lazily().unwrap() };
     let issue = |role: Role, tenant: &str| IssueTokenRequest {
         name: "ana".into(),
         role: role.into(),
@@ -456,7 +456,7 @@ async fn changed_certificates_are_reloaded_and_open_calls_continue() {
         async move { admin.issue_token(request).await.unwrap().into_inner().secret }
     };
     let (submitter, worker) = (token_of(Role::Submitter, "reef").await, token_of(Role::Worker, "").await);
-    let watcher = Caller { line: dial(&old, &submitter).lazily().unwrap() };
+    let watcher = Caller { connection: dial(&old, &submitter).lazily().unwrap() };
     let job_id = cluster.lasting_job(&watcher, "reef", "a request").await.job_id;
     let watch = WatchJobRequest { job_id: job_id.clone(), after_seq: 0 };
     let mut stream = watcher.jobs().watch_job(watch).await.unwrap().into_inner();
@@ -508,7 +508,7 @@ async fn silent_handshakes_block_nothing_and_end_after_ten_seconds() {
         token: Some(Secret::new(&cluster.first_token())),
         ..Dial::to(&cluster.coordinator.url())
     };
-    Caller { line: operator.lazily().unwrap() }.list().await.unwrap();
+    Caller { connection: operator.lazily().unwrap() }.list().await.unwrap();
     assert!(
         begun.elapsed() < Duration::from_secs(5),
         "it waited for the silent connections: {:?}",

@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use crate::callers::{is, said};
-use crate::support::{FakeTrainer, TestCluster};
+use crate::support::{FakeTrainer, TestCluster, reason_of};
 use bytes::Bytes;
 use fathom_coordinator::retention::Policy;
 use fathom_core::scene::{BlobRef, Manifest};

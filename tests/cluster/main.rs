@@ -5,6 +5,7 @@
 
 mod access;
 mod artifacts;
+mod blobs;
 #[path = "../support/callers.rs"]
 mod callers;
 mod datasets;

@@ -1,11 +1,11 @@
-//! Stages of a job beside training. Partitions agree on one water,
-//! and borders are trained after the merge. Losses of workers or coordinators change no byte. An evaluation
-//! includes its pictures.
+//! Stages of a job beside training. Partitions agree on one water, and borders are trained after the merge.
+//! Losses of workers or coordinators change no byte. An evaluation includes its pictures.
 
 use std::sync::Arc;
 
 use crate::support::{self, FakeTrainer, TestCluster, reason_of};
 use bytes::Bytes;
+use fathom_coordinator::schedule::Stage;
 use fathom_core::config::{JobConfig, WaterPartitions};
 use fathom_core::gpu::{GpuOptions, device_for_test};
 use fathom_core::water::{Water, WaterRecord};
@@ -17,7 +17,7 @@ use prost::Message;
 use serde_json::Value;
 
 /// A small job whose partitions train the water jointly if there are several.
-fn refining(columns: u32) -> JobConfig {
+fn joint(columns: u32) -> JobConfig {
     let mut config = JobConfig::default();
     config.data.test_every = 5;
     config.partition.columns = columns;
@@ -38,11 +38,17 @@ fn water_of(model: &[u8], cluster: &TestCluster) -> WaterRecord {
     fathom_core::ply::water_record(&path).unwrap().expect("a model without a water")
 }
 
+#[test]
+fn workers_execute_the_stages_that_the_table_gives_them() {
+    let of_table: Vec<v1::Stage> = Stage::of_workers().into_iter().map(v1::Stage::from).collect();
+    assert_eq!(fathom_worker::execute::STAGES[..], of_table);
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn partitions_agree_on_one_water_between_their_two_tasks() {
     let cluster = TestCluster::start().await;
     let _workers = [cluster.worker(FakeTrainer::quick()), cluster.worker(FakeTrainer::quick())];
-    let job = cluster.finished(&submit(&cluster, "refines", &refining(2)).await).await;
+    let job = cluster.finished(&submit(&cluster, "joint", &joint(2)).await).await;
     assert_eq!(job.state(), v1::JobState::Succeeded, "{}", job.error);
     let tasks: Vec<&str> = job.tasks.iter().map(|task| task.task_id.as_str()).collect();
     let expected = "plan global first_part-0000 first_part-0001 exchange partition-0000 partition-0001 merge evaluate artifacts";
@@ -50,7 +56,7 @@ async fn partitions_agree_on_one_water_between_their_two_tasks() {
     let iterations = |task: usize| job.tasks[task].progress.unwrap().iterations;
     for partition in 0..2 {
         let (first, rest) = (iterations(2 + partition), iterations(5 + partition));
-        assert_eq!(refining(2).water.free_iterations(first + rest), first, "not two thirds of the run");
+        assert_eq!(joint(2).water.free_iterations(first + rest), first, "not two thirds of the run");
     }
     assert_eq!(job.progress, 1.0);
 
@@ -88,12 +94,12 @@ async fn partitions_agree_on_one_water_between_their_two_tasks() {
 async fn losses_in_either_part_of_a_partition_change_no_byte() {
     use v1::Stage::{FirstPart, Partition};
     let mut cluster = TestCluster::start().await;
-    let undisturbed = submit(&cluster, "undisturbed", &refining(2)).await;
+    let undisturbed = submit(&cluster, "undisturbed", &joint(2)).await;
     let worker = cluster.worker(FakeTrainer::quick());
     assert_eq!(cluster.finished(&undisturbed).await.state(), v1::JobState::Succeeded);
     worker.leave().await;
 
-    let disturbed = submit(&cluster, "disturbed", &refining(2)).await;
+    let disturbed = submit(&cluster, "disturbed", &joint(2)).await;
     let is_checkpointed = |job: &v1::Job, stage: v1::Stage| {
         job.tasks.iter().any(|task| task.stage() == stage && task.checkpoint_iteration > 0)
     };
@@ -127,14 +133,14 @@ async fn losses_in_either_part_of_a_partition_change_no_byte() {
 async fn one_partition_exchanges_nothing_and_the_user_is_warned() {
     let cluster = TestCluster::start().await;
     let _worker = cluster.worker(FakeTrainer::quick());
-    let job = cluster.finished(&submit(&cluster, "alone", &refining(1)).await).await;
+    let job = cluster.finished(&submit(&cluster, "alone", &joint(1)).await).await;
     assert_eq!(job.state(), v1::JobState::Succeeded, "{}", job.error);
     assert!(job.tasks.iter().all(|task| task.stage() != v1::Stage::FirstPart));
     let warned = cluster.events(&job.job_id, 0).await.into_iter().any(|event| {
         matches!(event.event, Some(v1::job_event::Event::Warning(w)) if w.message.contains("water.partitions"))
     });
     assert!(warned, "nothing was said");
-    let mut endless = refining(2);
+    let mut endless = joint(2);
     endless.water.freeze_at = 1.0;
     let request = cluster.request_with(&cluster.manifest, "endless", &endless).await;
     let refused = cluster.jobs().create_job(request).await.unwrap_err();
@@ -216,7 +222,7 @@ async fn a_real_job_has_one_water_joint_or_frozen() {
     let cluster = TestCluster::start().await;
     let _worker = cluster.worker(Arc::new(executor));
     let run = async |partitions: WaterPartitions, neighbours_from: f64| {
-        let mut config = refining(2);
+        let mut config = joint(2);
         config.train.iterations = 160;
         config.train.max_gaussians = 1000;
         config.water.partitions = partitions;

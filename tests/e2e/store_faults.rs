@@ -10,7 +10,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use crate::processes::{Service, fail, fathom, json, output_of, succeed, tiny_scene, under};
-use crate::small_disk::{SmallDisk, wait_for};
+use crate::small_disk::{SmallDisk, mount, wait_for};
 
 /// Growth increment of sled's log.
 const SEGMENT_BYTES: u64 = 512 << 10;
@@ -245,7 +245,7 @@ fn verify_export_and_token_list_never_write_the_data_dir() {
             fail(&["store", "verify", "--data-dir", &data, "--scratch", &disk.0.to_string_lossy()]);
         assert!(error.contains("--scratch DIR"), "{error}");
         std::fs::remove_file(ballast).expect("room");
-        disk.make_read_only();
+        assert!(mount(&["-o", "remount,ro"], &disk.0), "it was mounted before");
         look("on a read-only disk");
     }
     let scratch = under(folder.path(), "scratch");

@@ -74,7 +74,6 @@ fn a_disk_full_to_the_last_byte_loses_nothing() {
     let said = harness.coordinator().said();
     assert!(said.contains("free space or repair the disk and start the coordinator again"), "{said}");
     assert!(!harness.try_coordinator(), "a coordinator serves from a disk without a byte of room");
-    drop(full);
     std::fs::remove_file(&ballast).expect("room");
     harness.start_coordinator();
     let stored = harness.show(&job.id)["priority"].as_u64();

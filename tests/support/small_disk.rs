@@ -21,19 +21,14 @@ pub fn wait_for<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
     }
 }
 
-/// A small file system in memory; gone when this is dropped.
-pub struct SmallDisk(PathBuf);
+/// A small file system in memory, mounted at this path; gone when this is dropped.
+pub struct SmallDisk(pub PathBuf);
 
 impl SmallDisk {
     /// `None` if this user may not mount one.
     pub fn mounted(at: &Path, bytes: u64) -> Option<Self> {
         std::fs::create_dir_all(at).expect("a folder");
         mount(&["-t", "tmpfs", "-o", &format!("size={bytes}"), "none"], at).then(|| Self(at.to_owned()))
-    }
-
-    /// Refuses all writes from now on.
-    pub fn make_read_only(&self) {
-        assert!(mount(&["-o", "remount,ro"], &self.0), "it was mounted before");
     }
 
     /// Writes until the disk is full; returns the file that fills it.
@@ -53,7 +48,8 @@ impl Drop for SmallDisk {
     }
 }
 
-fn mount(words: &[&str], at: &Path) -> bool {
+/// Runs `mount` with these words; whether it succeeded.
+pub fn mount(words: &[&str], at: &Path) -> bool {
     let status = Command::new("mount").args(words).arg(at).stderr(Stdio::null()).status();
     status.is_ok_and(|status| status.success())
 }

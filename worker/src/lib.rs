@@ -16,10 +16,12 @@ pub mod execute;
 mod fetch;
 pub mod gpus;
 mod heartbeat;
+mod leaving;
 mod logs;
 mod metrics;
 mod retry;
 mod session;
+mod training_thread;
 mod views;
 
 use std::collections::HashMap;

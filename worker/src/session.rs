@@ -1,20 +1,18 @@
 //! The main loop of a worker: register, claim, fetch, execute, submit, repeat.
 
-use std::sync::atomic::{AtomicU32, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
+use std::sync::atomic::AtomicU32;
 use std::time::Duration;
 
 use bytes::Bytes;
 use fathom_core::scene::BlobRef;
 use fathom_observe::{attempt_span, capture, threads};
 use fathom_proto::dial::{Connection, Dial, reason};
-use fathom_proto::v1::Progress;
 use fathom_proto::worker::v1;
 use fathom_proto::worker::v1::worker_service_client::WorkerServiceClient;
 use fathom_proto::{WORKER_PROTOCOL_VERSION, stage_name};
-use futures::future::BoxFuture;
 use tokio::runtime::Handle;
-use tokio::sync::{Notify, OwnedMutexGuard, oneshot, watch};
+use tokio::sync::watch;
 use tokio::time::Instant;
 use tonic::Status;
 use tracing::Instrument;
@@ -22,12 +20,14 @@ use uuid::Uuid;
 
 use crate::blobs::{BlobClient, BlobSource, to_proto};
 use crate::cache::{BlobCache, KEEP_EVERY};
-use crate::execute::{Control, Executor, Stop, TaskError, TaskInput, TaskOutput};
+use crate::execute::{Executor, Stop, TaskError, TaskOutput};
 use crate::fetch::Fetch;
 use crate::heartbeat::{Heartbeat, Pulse};
+use crate::leaving::{SUBMIT_WITHIN, left_for, stop_requested};
 use crate::logs::Shipper;
 use crate::metrics::{Ended, GpuMetrics};
 use crate::retry::{Repeated, is_over, pauses, until_answered, will_pass};
+use crate::training_thread::{Mailbox, StopOnDrop, TaskControl, spawn_training};
 use crate::{WorkerConfig, WorkerError};
 
 /// Time that a claim may wait in the coordinator.
@@ -36,8 +36,6 @@ const CLAIM_WAIT_MS: u32 = 10_000;
 const CLAIM_GRACE: Duration = Duration::from_secs(10);
 /// Time limit for a leaving worker to submit its checkpoint and return its task.
 const LEAVE_WITHIN: Duration = Duration::from_secs(20);
-/// Time limit for a leaving worker to submit a finished result. Service managers kill after about a minute.
-const SUBMIT_WITHIN: Duration = Duration::from_secs(30);
 /// Time limit for a leaving worker to ask for the answer to a pending claim.
 const ANSWERED_WITHIN: Duration = Duration::from_secs(5);
 /// Reason that a leaving worker reports when it returns a task.
@@ -516,145 +514,5 @@ impl Session {
                 }
             }
         }
-    }
-}
-
-async fn stop_requested(stopping: &mut watch::Receiver<bool>) {
-    // An error means that the sender is gone: then only the end of the process ends the work.
-    if stopping.wait_for(|stopping| *stopping).await.is_err() {
-        std::future::pending::<()>().await;
-    }
-}
-
-/// Completes `patience` after the worker was asked to leave.
-async fn left_for(stopping: &mut watch::Receiver<bool>, patience: Duration) {
-    stop_requested(stopping).await;
-    tokio::time::sleep(patience).await;
-}
-
-/// Starts the training thread (in a simulation, a task).
-fn spawn_training(
-    executor: Arc<dyn Executor>,
-    input: TaskInput,
-    control: Arc<TaskControl>,
-    seat: OwnedMutexGuard<()>,
-) -> oneshot::Receiver<Result<TaskOutput, TaskError>> {
-    let (sender, receiver) = oneshot::channel();
-    let span = tracing::Span::current();
-    if threads::are_simulated() {
-        let training = async move {
-            let _seat = seat;
-            let result = executor.simulate(&input, control.as_ref()).await;
-            // The receiver is gone if the work was abandoned.
-            let _ = sender.send(result);
-        };
-        tokio::spawn(training.instrument(span));
-        return receiver;
-    }
-    let started = std::thread::Builder::new().name("training".into()).spawn(move || {
-        let _seat = seat;
-        let result = span.in_scope(|| executor.execute(&input, control.as_ref()));
-        // As above.
-        let _ = sender.send(result);
-    });
-    if let Err(error) = started {
-        tracing::error!(%error, "the training thread cannot start");
-    }
-    receiver
-}
-
-/// Stops the training thread when its result is no longer awaited.
-struct StopOnDrop(Arc<TaskControl>);
-
-impl Drop for StopOnDrop {
-    fn drop(&mut self) {
-        self.0.gone.send_replace(true);
-    }
-}
-
-/// The checkpoint that waits for upload.
-#[derive(Default)]
-struct Mailbox {
-    waiting: Mutex<Option<(Bytes, u32)>>,
-    arrived: Notify,
-}
-
-impl Mailbox {
-    fn put(&self, bytes: Bytes, iteration: u32) {
-        *self.waiting.lock().unwrap_or_else(PoisonError::into_inner) = Some((bytes, iteration));
-        self.arrived.notify_one();
-    }
-
-    async fn take(&self) -> (Bytes, u32) {
-        loop {
-            if let Some(checkpoint) = self.waiting.lock().unwrap_or_else(PoisonError::into_inner).take() {
-                return checkpoint;
-            }
-            self.arrived.notified().await;
-        }
-    }
-}
-
-/// The control of one attempt's thread.
-struct TaskControl {
-    pulse: Arc<Pulse>,
-    blobs: BlobClient,
-    runtime: Handle,
-    mailbox: Mailbox,
-    metrics: Arc<GpuMetrics>,
-    /// The last reported iteration.
-    reported: AtomicU32,
-    /// Whether this attempt was abandoned. The pulse soon serves the next task, and reports of this attempt
-    /// must not be attributed to that one.
-    gone: watch::Sender<bool>,
-    /// Whether the worker must leave.
-    stopping: watch::Receiver<bool>,
-}
-
-impl TaskControl {
-    fn is_gone(&self) -> bool {
-        *self.gone.borrow()
-    }
-}
-
-impl Control for TaskControl {
-    fn report(&self, progress: Progress) {
-        if !self.is_gone() {
-            let before = self.reported.swap(progress.iteration, Ordering::Relaxed);
-            self.metrics.trained(before, &progress);
-            self.pulse.report(progress);
-        }
-    }
-
-    fn checkpoint(&self, bytes: Bytes, iteration: u32) {
-        self.mailbox.put(bytes, iteration);
-    }
-
-    fn stop_reason(&self) -> Option<Stop> {
-        if self.is_gone() { Some(Stop::Abandon) } else { self.pulse.stop_reason() }
-    }
-
-    fn upload(&self, bytes: Bytes) -> Result<BlobRef, TaskError> {
-        self.runtime.block_on(self.uploading(bytes))
-    }
-
-    fn uploading(&self, bytes: Bytes) -> BoxFuture<'_, Result<BlobRef, TaskError>> {
-        let (mut gone, source) = (self.gone.subscribe(), BlobSource::Bytes(bytes));
-        let mut stopping = self.stopping.clone();
-        Box::pin(async move {
-            tokio::select! {
-                // Abandoned work uploads nothing, not even small files.
-                biased;
-                _ = gone.wait_for(|gone| *gone) => Err(TaskError::Stopped { checkpoint: None }),
-                uploaded = self.blobs.upload(&source) => uploaded.map_err(TaskError::environment),
-                () = left_for(&mut stopping, SUBMIT_WITHIN) => {
-                    let reason = self.blobs.trouble().latest();
-                    let reason = reason.as_deref().unwrap_or("it does not answer");
-                    tracing::warn!(reason, "leaving without an answer from the coordinator: a part of the \
-                        result was not submitted");
-                    Err(TaskError::Stopped { checkpoint: None })
-                }
-            }
-        })
     }
 }

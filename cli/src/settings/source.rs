@@ -256,7 +256,7 @@ pub fn unit(of: &str, meaning: &str, before: &str) -> String {
         () if has("MiB") => "MiB",
         () if begins("Metres") => "metres",
         () if has("pixels") && of.starts_with('u') => "pixels",
-        () if has("usual viewing distances") || has("scene scales") => "scene scales",
+        () if has("scene scales") => "scene scales",
         () if has("deviations") => "standard deviations",
         () => "",
     };

@@ -284,7 +284,7 @@ fn report(out: &Path, json: bool) -> Result<()> {
     output::line(format!("model:   {}", out.join("model.ply").display()));
     output::line(format!("plan:    {}", out.join("plan.png").display()));
     output::line(format!("renders: {}", out.join("renders").display()));
-    output::lines(super::eval::summary(&metrics));
+    output::lines(crate::eval_summary::summary(&metrics));
     Ok(())
 }
 

@@ -179,7 +179,7 @@ impl Frame {
     }
 
     /// Sets the water parameters only; their dependence on range and direction stays.
-    pub fn set_nine(&self, gpu: &Gpu, water: &Water) {
+    pub fn set_water_parameters(&self, gpu: &Gpu, water: &Water) {
         for (row, values) in [water.beta_d, water.beta_b, water.b_inf].into_iter().enumerate() {
             gpu.write(&self.water, 16 * row as u64, &values.map(|value| value as f32));
         }

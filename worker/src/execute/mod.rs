@@ -35,7 +35,7 @@ use crate::views::{PhotographFile, PhotographSource};
 pub const SPEC_FORMAT: u32 = 2;
 
 /// Stages that this worker executes. A stage is a row here, an arm of [`CoreExecutor::run`], and a file.
-const STAGES: [Stage; 5] =
+pub const STAGES: [Stage; 5] =
     [Stage::Global, Stage::FirstPart, Stage::Partition, Stage::Borders, Stage::Evaluate];
 
 /// A task with all its inputs on this machine.

@@ -229,7 +229,7 @@ impl DeviceMedium {
     /// Sets the water from finite unconstrained parameters in the order of eq. 8.
     pub fn set_raw(&self, gpu: &Gpu, frame: &Frame, raw: [f32; 9]) {
         gpu.write(&self.state, 0, &raw);
-        frame.set_nine(gpu, &Water::from_raw(raw.map(f64::from), self.run.unit));
+        frame.set_water_parameters(gpu, &Water::from_raw(raw.map(f64::from), self.run.unit));
     }
 
     /// Restarts descent at the unconstrained parameters `raw`. `standard_error` holds the standard errors of
