@@ -148,7 +148,7 @@ MUTANTS = [
     (
         "a second worker keeps its lease when the task ends",
         SRC + "schedule/task.rs",
-        "self.rival = None;",
+        "self.second = None;",
         "",
         "lib",
         CONFORMANCE + "sled::a_slow_task_gets_a_second_worker_and_the_first_result_counts",

@@ -24,9 +24,9 @@ ROOT = Path(__file__).resolve().parent.parent
 MARK = re.compile(r"[-+*>=]+$|#+$|\d+[.)]$|\||```|~~~|:{1,2}$")
 ITEM = re.compile(r"(\s*)([-*+]|\d+[.)])(\s+)(?=\S)")
 DRAWN = re.compile("[\u2500-\u257f\u25ba]")
-# Lines that are never joined: tables, headings, HTML, link definitions, directives, and settings in settings
-# files.
-FIXED = re.compile(r"\s*(\||#{1,6}\s|<|\[[^\]]+\]:\s|shellcheck |!|---|===|@)")
+# Lines that are never joined: tables, headings, HTML, link definitions, items that are one link, directives,
+# and settings in settings files.
+FIXED = re.compile(r"\s*(\||#{1,6}\s|<|\[[^\]]+\]:\s|- \[[^\]]+\]\([^)\s]+\)$|shellcheck |!|---|===|@)")
 SETTING = re.compile(r"\s*([\w.-]+ = |\[[\w.-]+\]$)")
 
 

@@ -19,10 +19,10 @@ pub const STOP_WITH_PARENT: &str = "--stop-with-stdin";
 pub const LISTENING: &str = "listening on ";
 /// Opening a store and binding a port takes well under a second; repairing a store takes longer.
 const START_PATIENCE: Duration = Duration::from_secs(60);
-/// Heartbeats within one machine are seconds late at most. After all processes were killed, a short lease
-/// lets a resumed run continue at once.
+/// Heartbeats within one machine are seconds late at most. After all processes were killed, a resumed run
+/// continues within this lease.
 const LEASE_MS: &str = "10000";
-/// All workers of this run have the same memory, so a task too large for them fails after two checks.
+/// All workers of this run have the same memory, so a task too large for them fails after this time.
 const CAPACITY_TIMEOUT_MS: &str = "3000";
 /// Environment variables that configure a user's own service. They are removed, because children only talk to
 /// each other on this machine.

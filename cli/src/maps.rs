@@ -27,9 +27,9 @@ pub enum Map {
 }
 
 /// Share of the nearest and of the farthest pixels that the scale of the range PNGs excludes.
-const STRAYS: f64 = 0.01;
+const EXCLUDED_SHARE: f64 = 0.01;
 /// Pixels sampled from each picture for the scale.
-const VOTES: usize = 1024;
+const SAMPLES_PER_PICTURE: usize = 1024;
 /// Header bytes in a file of `picture::encode_npy`.
 const NPY_HEADER: usize = 128;
 
@@ -143,7 +143,7 @@ impl MapWriter {
 
     /// Samples ranges of pixels that are more than half covered; translucent pixels have no certain range.
     fn vote(&mut self, range: &[f32], alpha: &[f32]) {
-        let step = range.len().div_ceil(VOTES).max(1);
+        let step = range.len().div_ceil(SAMPLES_PER_PICTURE).max(1);
         let some = range.iter().zip(alpha).step_by(step);
         self.votes.extend(some.filter(|(_, alpha)| **alpha > 0.5).map(|(range, _)| range));
     }
@@ -155,7 +155,7 @@ impl Scale {
         votes.sort_unstable_by(f32::total_cmp);
         let last = votes.len().saturating_sub(1) as f64;
         let at = |share: f64| votes.get((share * last).round() as usize).copied();
-        match (at(STRAYS), at(1.0 - STRAYS)) {
+        match (at(EXCLUDED_SHARE), at(1.0 - EXCLUDED_SHARE)) {
             (Some(near), Some(far)) => Self { near, far },
             _ => Self { near: 0.0, far: 1.0 },
         }

@@ -100,11 +100,11 @@ pub fn summary_lines(metrics: &Value) -> Vec<String> {
     )];
     let step = |at: &str| metrics.pointer(&format!("/seams/range_step/{at}")).and_then(Value::as_f64);
     if let (Some(median), Some(ratio)) = (step("border/median"), step("border/ratio")) {
-        let control = step("control/ratio").map_or_else(|| "none".to_owned(), |ratio| format!("{ratio:.2}"));
+        let control = step("control/ratio").map(|ratio| format!("; {ratio:.2} times where nothing was cut"));
         lines.push(format!(
-            "         the surface steps by {:.2} % of its depth across borders, {ratio:.2} times what it does beside them; where \
-             nothing was cut {control} times",
-            100.0 * median
+            "         the surface steps by {:.2} % of its depth across borders, {ratio:.2} times as much as beside them{}",
+            100.0 * median,
+            control.unwrap_or_default()
         ));
     }
     lines
@@ -130,7 +130,7 @@ mod tests {
         assert!(lines[0].contains(said), "{}", lines[0]);
         assert!(lines[0].ends_with("where nothing was cut -0.12 dB"), "{}", lines[0]);
         assert!(lines[1].contains("0.20 % of its depth across borders, 2.00 times"), "{}", lines[1]);
-        assert!(lines[1].ends_with("where nothing was cut none times"), "{}", lines[1]);
+        assert!(lines[1].ends_with("2.00 times as much as beside them"), "{}", lines[1]);
         metrics["seams"]["range_step"]["border"]["ratio"] = Value::Null;
         assert_eq!(summary_lines(&metrics).len(), 1);
         metrics["seams"]["seam_db_error"] = json!(0.125);

@@ -34,15 +34,15 @@ pub fn noted(shared: &State, job: &JobId, shortfall: Shortfall) -> Gap {
     let mut gaps = shared.gaps.lock().unwrap_or_else(PoisonError::into_inner);
     let since_ms = match gaps.get(job) {
         Some(gap) => gap.since_ms,
-        None => begin(job, &shortfall, shared.clock.now_ms()),
+        None => log_start(job, &shortfall, shared.clock.now_ms()),
     };
     let gap = Gap { shortfall, since_ms };
     gaps.insert(job.clone(), gap.clone());
     gap
 }
 
-/// Logs that a job begins to wait.
-fn begin(job: &JobId, shortfall: &Shortfall, now_ms: u64) -> u64 {
+/// Logs that a job begins to wait, and returns the time.
+fn log_start(job: &JobId, shortfall: &Shortfall, now_ms: u64) -> u64 {
     tracing::warn!(%job, %shortfall, "a job waits for workers");
     now_ms
 }
@@ -67,7 +67,7 @@ pub async fn look(shared: &State) -> Result<(), StoreError> {
             let Some(shortfall) = shortfall(&tenant, needs.into_iter(), &peers) else { continue };
             let since_ms = match before.get(&job) {
                 Some(gap) => gap.since_ms,
-                None => begin(&job, &shortfall, now_ms),
+                None => log_start(&job, &shortfall, now_ms),
             };
             let (waited_ms, limit_ms) =
                 (now_ms.saturating_sub(since_ms), u64::from(shared.capacity_timeout_ms));
@@ -79,7 +79,7 @@ pub async fn look(shared: &State) -> Result<(), StoreError> {
     }
     for (job, reason) in over {
         match shared.jobs.apply(&job, Event::GiveUp { reason }, now_ms).await {
-            // It has ended or was deleted since the check.
+            // An error here means that it has ended or was deleted since the check.
             Ok(_) | Err(StoreError::Refused(_) | StoreError::JobNotFound(_)) => shared.wakeups.interrupted(),
             Err(error) => return Err(error),
         }

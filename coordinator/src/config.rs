@@ -33,7 +33,7 @@ pub struct CoordinatorConfig {
     /// Time without progress after which a task is requeued although its worker still renews, milliseconds.
     /// Default 1 800 000 (half an hour, because downloads of photographs report no progress); 0 disables it.
     pub stall_ms: u32,
-    /// Run a duplicate attempt on an idle worker when a partition takes this many times longer per iteration
+    /// Run a second attempt on an idle worker when a partition takes this many times longer per iteration
     /// than its siblings; the first result counts. Default 3; 0 disables it.
     pub straggler_factor: f64,
     /// Minimum age of an attempt before a duplicate one starts, milliseconds. Default 600 000.

@@ -35,8 +35,8 @@ use crate::metrics::rpc::RpcLayer;
 use crate::metrics::store::CountedStore;
 use crate::objects::{Removed, TenantBlobs};
 use crate::own_tasks::run_own_tasks;
+use crate::rate_limited_log::RateLimitedLog;
 use crate::retention::{Housekeeping, Policy, RetentionError, collect, collect_garbage};
-use crate::seldom::Seldom;
 use crate::services::{Admin, Jobs, Uploads, Workers, logs, release_disowned};
 use crate::state::{State, stopped};
 use crate::store::{SledOptions, SledStore, Store};
@@ -235,7 +235,7 @@ where
         clock,
         places: Places::default(),
         calls: Arc::new(OpenCalls::default()),
-        refused: Seldom::default(),
+        refused: RateLimitedLog::default(),
     };
     let connections = Connections::new(room);
 

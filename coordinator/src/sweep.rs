@@ -53,7 +53,7 @@ pub async fn sweep_leases(shared: Arc<State>) -> Result<(), StoreError> {
                 Expired::Silent => "its worker stopped renewing",
                 Expired::Stalled => "its worker makes no progress",
             };
-            tracing::warn!(job = %lease.job, task = %lease.task, attempt = lease.attempt, fence = lease.fence, why, "lease revoked");
+            tracing::warn!(job = %lease.job, task = %lease.task, attempt = lease.attempt, fence = lease.fence, why, "lease expired");
             logs::note(&shared, lease, Level::WARN, &format!("the lease was revoked: {why}"));
         }
         if !taken_back.is_empty() {

@@ -26,7 +26,7 @@ use tokio_rustls::server::TlsStream;
 
 use crate::config::CoordinatorConfig;
 use crate::error::CoordinatorError;
-use crate::seldom::Seldom;
+use crate::rate_limited_log::RateLimitedLog;
 
 /// Interval of the checks. A change is in use after two checks.
 const LOOK_EVERY: Duration = Duration::from_secs(2);
@@ -40,7 +40,7 @@ pub struct Tls {
     first: Pems,
     in_use: RwLock<Arc<ServerConfig>>,
     /// Handshakes that failed.
-    failed: Seldom,
+    failed: RateLimitedLog,
 }
 
 impl Tls {
@@ -53,7 +53,7 @@ impl Tls {
         let files = Files { cert: cert.clone(), key: key.clone(), client_ca: config.client_ca.clone() };
         let first = files.read().map_err(CoordinatorError::Config)?;
         let in_use = RwLock::new(first.server_config().map_err(CoordinatorError::Config)?);
-        Ok(Some(Arc::new(Self { files, first, in_use, failed: Seldom::default() })))
+        Ok(Some(Arc::new(Self { files, first, in_use, failed: RateLimitedLog::default() })))
     }
 
     /// Checks the files as long as it runs, and applies changes.

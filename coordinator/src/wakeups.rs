@@ -29,7 +29,7 @@ impl Wakeups {
         self.work.send_modify(|version| *version = version.wrapping_add(1));
     }
 
-    /// Wakes watchers, when there cannot be more work than before.
+    /// Wakes watchers, after a change that creates no work.
     pub fn progressed(&self) {
         self.changes.send_modify(|version| *version = version.wrapping_add(1));
     }

@@ -255,8 +255,8 @@ async fn a_real_job_has_one_water_joint_or_frozen() {
     assert_eq!((frozen.source.as_str(), none), ("descended", None));
     // A partition that ends beside its neighbours submits only its own cell; all share the water of the
     // coarse model.
-    let (beside, none, cropped) = run(WaterPartitions::Frozen, 0.7).await;
-    assert_eq!((&beside, none), (&frozen, None));
+    let (is_second, none, cropped) = run(WaterPartitions::Frozen, 0.7).await;
+    assert_eq!((&is_second, none), (&frozen, None));
     assert!(
         in_margins > 50 && 10 * cropped < in_margins,
         "{cropped} Gaussians beyond their cells, {in_margins} where margins are trained"

@@ -55,7 +55,7 @@ fn is_durable(event: &Value) -> bool {
 
 /// Whether the message of a returned task counts as a lost worker.
 fn is_loss(message: &str) -> bool {
-    message.starts_with("lease expired") || message.starts_with("lease revoked")
+    message.starts_with("lease expired")
 }
 
 impl History {

@@ -4,7 +4,8 @@ use std::time::Duration;
 
 use tokio::sync::watch;
 
-/// Time limit for a leaving worker to submit a finished result. Service managers kill after about a minute.
+/// Time limit for a leaving worker to submit a finished result. Service managers kill a process that takes
+/// too long (`TimeoutStopSec` in `deploy/fathom-worker.service`).
 pub const SUBMIT_WITHIN: Duration = Duration::from_secs(30);
 
 /// Completes when the worker is asked to leave.
@@ -16,7 +17,7 @@ pub async fn stop_requested(stopping: &mut watch::Receiver<bool>) {
 }
 
 /// Completes `patience` after the worker was asked to leave.
-pub async fn left_for(stopping: &mut watch::Receiver<bool>, patience: Duration) {
+pub async fn leave_deadline(stopping: &mut watch::Receiver<bool>, patience: Duration) {
     stop_requested(stopping).await;
     tokio::time::sleep(patience).await;
 }

@@ -23,7 +23,7 @@ use crate::cache::{BlobCache, KEEP_EVERY};
 use crate::execute::{Executor, Stop, TaskError, TaskOutput};
 use crate::fetch::Fetch;
 use crate::heartbeat::{Heartbeat, Pulse};
-use crate::leaving::{SUBMIT_WITHIN, left_for, stop_requested};
+use crate::leaving::{SUBMIT_WITHIN, leave_deadline, stop_requested};
 use crate::logs::Shipper;
 use crate::metrics::{Ended, GpuMetrics};
 use crate::retry::{Repeated, is_over, pauses, until_answered, will_pass};
@@ -41,7 +41,7 @@ const ANSWERED_WITHIN: Duration = Duration::from_secs(5);
 /// Reason that a leaving worker reports when it returns a task.
 const ASKED_TO_LEAVE: &str = "the worker was asked to leave";
 /// Log a warning at this interval while a training thread ignores a stop request.
-const STOPS_WITHIN: Duration = Duration::from_secs(5);
+const WARN_EVERY: Duration = Duration::from_secs(5);
 
 /// One GPU of a worker; a separate worker to the coordinator.
 pub struct Session {
@@ -108,7 +108,7 @@ impl Session {
     pub async fn run(self) -> Result<(), WorkerError> {
         let mut stopping = self.stopping.clone();
         self.until_stopped(&mut stopping, self.register_first()).await.transpose()?;
-        // A worker asked to stop during a task claims nothing more, not even to return it.
+        // A worker asked to stop during a task claims no further one: it would only have to return it.
         while !*stopping.borrow() {
             if self.until_stopped(&mut stopping, self.prepared()).await.transpose()?.is_none() {
                 break;
@@ -303,7 +303,7 @@ impl Session {
     /// between iterations. Until then it owns the GPU and the cached files.
     async fn training_ended(&self) {
         let since = Instant::now();
-        while tokio::time::timeout(STOPS_WITHIN, self.seat.lock()).await.is_err() {
+        while tokio::time::timeout(WARN_EVERY, self.seat.lock()).await.is_err() {
             let seconds = since.elapsed().as_secs();
             tracing::warn!(
                 seconds,
@@ -370,7 +370,7 @@ impl Session {
         let submitted = tokio::select! {
             biased;
             submitted = self.complete(lease, output, started, iterations) => Some(submitted),
-            () = left_for(&mut stopping, SUBMIT_WITHIN) => None,
+            () = leave_deadline(&mut stopping, SUBMIT_WITHIN) => None,
         };
         submitted.unwrap_or_else(|| {
             let reason = self.blobs.trouble().latest();

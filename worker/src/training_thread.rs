@@ -15,7 +15,7 @@ use tracing::Instrument;
 use crate::blobs::{BlobClient, BlobSource};
 use crate::execute::{Control, Executor, Stop, TaskError, TaskInput, TaskOutput};
 use crate::heartbeat::Pulse;
-use crate::leaving::{SUBMIT_WITHIN, left_for};
+use crate::leaving::{SUBMIT_WITHIN, leave_deadline};
 use crate::metrics::GpuMetrics;
 
 /// Starts the training thread (in a simulation, a task).
@@ -133,7 +133,7 @@ impl Control for TaskControl {
                 biased;
                 _ = gone.wait_for(|gone| *gone) => Err(TaskError::Stopped { checkpoint: None }),
                 uploaded = self.blobs.upload(&source) => uploaded.map_err(TaskError::environment),
-                () = left_for(&mut stopping, SUBMIT_WITHIN) => {
+                () = leave_deadline(&mut stopping, SUBMIT_WITHIN) => {
                     let reason = self.blobs.trouble().latest();
                     let reason = reason.as_deref().unwrap_or("it does not answer");
                     tracing::warn!(reason, "leaving without an answer from the coordinator: a part of the \

@@ -244,7 +244,7 @@ fn service_example<D: Declaration>(verb: &str, variable: &str) -> String {
 fn job_example() -> String {
     let head = format!(
         "Settings of a job, with their defaults: `fathom train DATA -o OUT --config FILE`, or with `fathom submit`. \
-         Flags and --set win over this file, and this file wins over a preset. Beside a section [water], --preset \
+         Flags and --set win over this file, and this file wins over a preset. Surroundings a section [water], --preset \
          must name the preset of this file. {GENERATED}"
     );
     let mut file = wrapped(&head, "# ") + "\n";

@@ -59,10 +59,10 @@ pub struct CoordinatorSettings {
     /// Time without progress after which another worker gets a task, milliseconds; 0 disables it
     #[arg(long, value_name = "MS", env = "FATHOM_STALL_MS")]
     stall_ms: Option<u32>,
-    /// Run a duplicate attempt when a task takes this many times longer than its siblings; 0 disables it
+    /// Run a second attempt when a task takes this many times longer than its siblings; 0 disables it
     #[arg(long, value_name = "FACTOR", env = "FATHOM_STRAGGLER_FACTOR", value_parser = finite)]
     straggler_factor: Option<f64>,
-    /// Run no duplicate attempt before the first attempt has run for this long, milliseconds
+    /// Run no second attempt before the first attempt has run for this long, milliseconds
     #[arg(long, value_name = "MS", env = "FATHOM_STRAGGLER_AFTER_MS")]
     straggler_after_ms: Option<u32>,
     /// Fail a job after this long without a worker that has enough GPU memory, milliseconds; 0 waits forever

@@ -3,6 +3,7 @@
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use clap::Args;
+use fathom_coordinator::schedule;
 use fathom_proto::stage_name;
 use fathom_proto::v1::{Job, JobState, Stage, Task, TaskState};
 use serde_json::{Value, json};
@@ -162,13 +163,17 @@ pub fn job_json(job: &Job) -> Value {
     })
 }
 
+fn is_per_partition(stage: Stage) -> bool {
+    schedule::Stage::from_proto(stage).is_some_and(|stage| stage.spec().per_partition)
+}
+
 fn task_json(task: &Task) -> Value {
     // A finished task only keeps its counts.
     let measured = task.progress.filter(|_| task.state() != TaskState::Done);
     json!({
         "task": task.task_id,
         "stage": stage_word(task.stage()),
-        "partition": matches!(task.stage(), Stage::Partition | Stage::FirstPart).then_some(task.partition),
+        "partition": is_per_partition(task.stage()).then_some(task.partition),
         "state": task_word(task.state()),
         "attempts": task.attempts,
         "errors": task.errors,

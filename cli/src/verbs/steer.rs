@@ -38,12 +38,12 @@ pub struct UpdateArgs {
     #[command(flatten)]
     which: OneJob,
     #[command(flatten)]
-    importance: Importance,
+    scheduling: SchedulingArgs,
 }
 
 /// Priority and parallelism of a job among others.
 #[derive(Args, Clone, Copy, Debug)]
-pub struct Importance {
+pub struct SchedulingArgs {
     /// Priority, -1000 to 1000: workers take tasks of higher priority first; at equal priority, those of the
     /// older job
     #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = clap::value_parser!(i32).range(-1000..=1000))]
@@ -71,7 +71,7 @@ pub async fn retry(args: OneJob) -> Result<()> {
 
 pub async fn update(args: UpdateArgs) -> Result<()> {
     let OneJob { job, service, json } = args.which;
-    let Importance { priority, max_parallel } = args.importance;
+    let SchedulingArgs { priority, max_parallel } = args.scheduling;
     let request = UpdateJobRequest { job_id: job, priority, max_parallel };
     let job = service.client().await?.update(request).await?;
     let limit = match job.max_parallel {

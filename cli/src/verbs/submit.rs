@@ -7,7 +7,7 @@ use clap::Args;
 use serde_json::json;
 
 use super::ServiceArgs;
-use super::steer::Importance;
+use super::steer::SchedulingArgs;
 use crate::config_args::JobArgs;
 use crate::error::Result;
 use crate::output;
@@ -31,7 +31,7 @@ pub struct SubmitArgs {
     #[arg(long, value_name = "UUID")]
     request_id: Option<String>,
     #[command(flatten)]
-    importance: Importance,
+    scheduling: SchedulingArgs,
     #[command(flatten)]
     service: ServiceArgs,
     /// Print {"job": ID, ...}
@@ -47,8 +47,8 @@ pub async fn run(args: SubmitArgs) -> Result<()> {
     let ticket = |name| JobTicket {
         name,
         request_id: &request_id,
-        priority: args.importance.priority.unwrap_or_default(),
-        max_parallel: args.importance.max_parallel.unwrap_or_default(),
+        priority: args.scheduling.priority.unwrap_or_default(),
+        max_parallel: args.scheduling.max_parallel.unwrap_or_default(),
     };
     let (job, views) = match (&args.data, &args.dataset) {
         (Some(data), _) => {

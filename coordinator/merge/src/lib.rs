@@ -273,7 +273,7 @@ fn in_order<'a>(
     Ok(plan.partitions.iter().filter_map(|p| Some((p, *by_id.get(&p.id)?))).collect())
 }
 
-/// Beside `out`, so that the rename stays on one file system.
+/// Surroundings `out`, so that the rename stays on one file system.
 fn temporary_name(out: &Path) -> PathBuf {
     let mut name = out.file_name().unwrap_or_default().to_owned();
     name.push(".part");

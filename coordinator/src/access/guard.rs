@@ -23,8 +23,8 @@ use super::places::{Kind, Places};
 use super::{Access, Principal, RateLimit, Refused, Role};
 use crate::clock::Clock;
 use crate::connections::Visit;
+use crate::rate_limited_log::RateLimitedLog;
 use crate::schedule::Tenant;
-use crate::seldom::Seldom;
 use crate::service_error::ServiceError;
 
 const JOBS: &str = "fathom.v1.JobService";
@@ -106,7 +106,7 @@ pub struct Guard {
     /// The open calls.
     pub calls: Arc<OpenCalls>,
     /// Refused calls.
-    pub refused: Seldom,
+    pub refused: RateLimitedLog,
 }
 
 impl Guard {

@@ -9,7 +9,7 @@ use futures::{Stream, StreamExt};
 use tokio::net::{TcpListener, TcpStream};
 
 use super::{Connection, Connections};
-use crate::seldom::Seldom;
+use crate::rate_limited_log::RateLimitedLog;
 
 /// Pause after a failure, such as no free descriptor: without a pause the loop would occupy a core.
 const PAUSE: Duration = Duration::from_millis(100);
@@ -19,7 +19,7 @@ pub type Accepted<C> = (C, Option<SocketAddr>);
 
 /// Connections of a listener. The stream never ends, and failures of single connections do not affect it.
 pub fn accepted(listener: TcpListener) -> impl Stream<Item = Accepted<TcpStream>> + Send {
-    futures::stream::unfold((listener, Seldom::default()), |(listener, failed)| async move {
+    futures::stream::unfold((listener, RateLimitedLog::default()), |(listener, failed)| async move {
         loop {
             match listener.accept().await {
                 Ok((stream, from)) => return Some(((stream, Some(from)), (listener, failed))),

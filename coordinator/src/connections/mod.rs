@@ -26,7 +26,7 @@ use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::time::Instant;
 use tonic::transport::server::{Connected, TlsConnectInfo};
 
-use crate::seldom::LOG_EVERY;
+use crate::rate_limited_log::LOG_EVERY;
 
 pub use accept::{Accepted, accepted};
 pub use room::Room;

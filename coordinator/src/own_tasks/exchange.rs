@@ -27,7 +27,7 @@ const FORMAT: u32 = 1;
 pub const MAX_FIRST_PART_BYTES: u64 = 64 << 10;
 
 /// Computes the input of the second parts, once all first parts are done.
-pub async fn find(objects: &BlobStore, view: &JobView) -> Result<TaskOutput, OwnTaskError> {
+pub async fn exchange_results(objects: &BlobStore, view: &JobView) -> Result<TaskOutput, OwnTaskError> {
     let config = config_of(&view.job)?;
     let mut results = Vec::new();
     let mut rows = BTreeMap::new();

@@ -123,7 +123,7 @@ async fn execute(shared: &State, grant: &Grant) -> Result<TaskOutput, OwnTaskErr
     let objects = shared.objects.of(&view.job.tenant)?;
     match grant.lease.task.stage {
         Stage::Plan => plan::plan_job(&objects, &view.job, shared.workers.connected(&view.job.tenant)).await,
-        Stage::Exchange => exchange::find(&objects, &view).await,
+        Stage::Exchange => exchange::exchange_results(&objects, &view).await,
         Stage::Merge => merge::merge_job(&objects, &view, &grant.lease).await,
         Stage::Artifacts => artifacts::assemble(&objects, &view).await,
         stage => Err(OwnTaskError::failed(format!("{stage} is a stage of workers"))),

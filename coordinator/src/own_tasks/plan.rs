@@ -3,10 +3,10 @@
 
 use std::collections::BTreeMap;
 
-use fathom_core::config::{JobConfig, Method, WaterPartitions};
+use fathom_core::config::{DEFAULT_MEMORY_GIB, JobConfig, Method, PartitionConfig, WaterPartitions};
 use fathom_core::scene::{Manifest, Points};
 use fathom_core::seams::{self, Axis};
-use fathom_plan::{Connected, Plan, PlanInput, Rect, picture, plan_for};
+use fathom_plan::{Connected, MemoryFrom, Plan, PlanInput, Rect, picture, plan_for};
 use fathom_proto::worker::v1::task_spec::Work;
 use fathom_proto::worker::v1::{
     BordersSpec, CommonSpec, EvaluateSpec, FocusBox, GlobalSpec, PartitionSpec, SeamLine, SeamLines, TaskSpec,
@@ -45,13 +45,7 @@ pub async fn plan_job(
     if config.borders.enabled && plan.borders.is_none() {
         warnings.push("borders.enabled has no effect here: it needs more than one partition".into());
     }
-    if config.partition.auto && connected.workers == 0 && config.partition.workers == 0 {
-        warnings.push(
-            "no worker was connected when the scene was partitioned, so the plan is for one; start workers first, or set \
-             partition.workers to their number"
-                .into(),
-        );
-    }
+    warnings.extend(warning_of_defaults(&plan, connected, &config.partition));
     let mut tasks = put_partitions(objects, &plan, &config).await?;
     let own = |stage: Stage| (stage.task(), PlannedTask::default());
     if let Some(stage) = &plan.global {
@@ -90,6 +84,26 @@ pub async fn plan_job(
     tasks.extend([own(Stage::Merge), own(Stage::Artifacts)]);
     let (plan_blob, picture) = (objects.put(plan_json.into()).await?, objects.put(plan_png.into()).await?);
     Ok(TaskOutput::planned(plan_blob, picture, Planned { tasks, warnings }))
+}
+
+/// What `partition.auto` assumed because no worker was connected and the configuration does not say it.
+fn warning_of_defaults(plan: &Plan, connected: Connected, config: &PartitionConfig) -> Option<String> {
+    let planned_for = plan.cut.planned_for.filter(|_| connected.workers == 0)?;
+    let mut assumed = Vec::new();
+    if config.workers == 0 {
+        assumed.push(("one worker".to_owned(), "partition.workers"));
+    }
+    if planned_for.memory_from == MemoryFrom::Default {
+        assumed.push((format!("{DEFAULT_MEMORY_GIB} GiB of GPU memory"), "partition.memory_gib"));
+    }
+    let (what, settings): (Vec<String>, Vec<&str>) = assumed.into_iter().unzip();
+    (!what.is_empty()).then(|| {
+        format!(
+            "no worker was connected when the scene was partitioned, so the plan assumes {}; start workers first, or set {}",
+            what.join(" with "),
+            settings.join(" and ")
+        )
+    })
 }
 
 /// A plan, as JSON and as a picture.
@@ -271,6 +285,40 @@ mod tests {
         assert_eq!(common_spec(&plan, &[3, 11], 0).clear_ranges, [3.0, 11.0]);
         plan.clear_ranges.clear();
         assert!(common_spec(&plan, &[3, 11], 0).clear_ranges.is_empty());
+    }
+
+    #[test]
+    fn a_plan_without_workers_names_what_it_assumes() {
+        let camera = PinholeCamera { width: 64, height: 48, fx: 50.0, fy: 50.0, cx: 32.0, cy: 24.0 };
+        let views: Vec<TrainView> = (0..40)
+            .map(|i| {
+                let eye = DVec3::new(f64::from(i), 0.0, 0.0);
+                let pose = Pose::looking_at(eye, eye + DVec3::Z, DVec3::Y);
+                TrainView { name: format!("{i:02}"), camera, pose, clear_range: 0.0 }
+            })
+            .collect();
+        let warned = |connected: Connected, change: fn(&mut PartitionConfig)| {
+            let mut config = JobConfig::default();
+            config.partition.auto = true;
+            change(&mut config.partition);
+            let input = PlanInput { views: &views, points: &Points::default(), config: &config };
+            warning_of_defaults(&plan_for(&input, connected).unwrap(), connected, &config.partition)
+                .unwrap_or_default()
+        };
+        let none = Connected::default();
+        let said = warned(none, |_| ());
+        assert!(
+            said.contains("assumes one worker with 8 GiB of GPU memory; start workers first, or set"),
+            "{said}"
+        );
+        assert!(said.ends_with("partition.workers and partition.memory_gib"), "{said}");
+        let said = warned(none, |p| p.workers = 3);
+        assert!(said.contains("assumes 8 GiB") && !said.contains("partition.workers"), "{said}");
+        let said = warned(none, |p| p.memory_gib = 24.0);
+        assert!(said.contains("assumes one worker;") && !said.contains("GiB"), "{said}");
+        assert_eq!(warned(none, |p| (p.workers, p.memory_gib) = (3, 24.0)), "");
+        assert_eq!(warned(Connected { workers: 2, memory_bytes: None }, |_| ()), "");
+        assert_eq!(warned(none, |p| p.auto = false), "");
     }
 
     #[test]

@@ -105,7 +105,7 @@ pub enum Expired {
 /// An event of a job.
 #[derive(Clone, Debug)]
 pub enum Event {
-    /// A worker takes a ready task, or starts a duplicate attempt at a slow one.
+    /// A worker takes a ready task, or starts a second attempt at a slow one.
     Claim {
         /// The task.
         task: TaskId,
@@ -117,8 +117,8 @@ pub enum Event {
         request_id: String,
         /// A new number, larger than all earlier fences.
         fence: u64,
-        /// Whether it is a duplicate attempt beside a slow worker.
-        beside: bool,
+        /// Whether it is a second attempt beside a slow worker.
+        is_second: bool,
     },
     /// A checkpoint has been uploaded.
     Checkpoint {

@@ -152,14 +152,14 @@ impl LeaseTable {
 
     /// Number of running leases by stage, and the sum of their training speeds.
     pub fn levels(&self) -> (BTreeMap<Stage, usize>, f64) {
-        let mut by_kind = BTreeMap::new();
+        let mut by_stage = BTreeMap::new();
         let mut iterations_per_second = 0.0;
         for running in self.all() {
-            *by_kind.entry(running.lease.task.stage).or_default() += 1;
+            *by_stage.entry(running.lease.task.stage).or_default() += 1;
             let speed = running.progress.map_or(0.0, |progress| f64::from(progress.iterations_per_second));
             iterations_per_second += if speed.is_finite() { speed } else { 0.0 };
         }
-        (by_kind, iterations_per_second)
+        (by_stage, iterations_per_second)
     }
 
     /// Iterations reported of all leased tasks of a job.

@@ -31,7 +31,7 @@ pub fn requeue_lost(
         let Some(record) = rows.tasks.get_mut(task).filter(|record| is_done(record)) else { continue };
         rows.job.iterations_done = rows.job.iterations_done.saturating_sub(record.iterations.into());
         record.losses += 1;
-        record.rivals = 0;
+        record.second_attempts = 0;
         record.last_errors.push(format!("result of attempt {}: {message}", record.attempts));
         let surplus = record.last_errors.len().saturating_sub(TaskRecord::ERRORS_KEPT);
         record.last_errors.drain(..surplus);
@@ -111,7 +111,7 @@ mod tests {
                 tenant: None,
             };
             let (peers, request_id, fence) = (Arc::default(), self.fence.to_string(), self.fence);
-            self.apply(Event::Claim { task, worker, peers, request_id, fence, beside: false }).unwrap();
+            self.apply(Event::Claim { task, worker, peers, request_id, fence, is_second: false }).unwrap();
             self.rows.tasks[&task].leases(&self.rows.job.job_id).remove(0)
         }
 

@@ -3,7 +3,7 @@
 //! The tenant with the fewest leases is served next. Within a tenant, jobs with a higher priority come first,
 //! then older ones; this also breaks ties between tenants. A tenant or a job at its limit waits.
 //!
-//! When no waiting task fits a worker, it may start a duplicate attempt at a slow task (`straggler.rs`), in
+//! When no waiting task fits a worker, it may start a second attempt at a slow task (`straggler.rs`), in
 //! the same order.
 //!
 //! A queue is derived from rows: [`Queue::note`] is called with every written row, in order of the writes.
@@ -56,7 +56,7 @@ struct OpenJob {
 struct Leased {
     /// The calls that got its leases: one or two.
     calls: Vec<Call>,
-    /// Data for a duplicate attempt; `None` if none is allowed.
+    /// Data for a second attempt; `None` if none is allowed.
     alone: Option<Alone>,
 }
 
@@ -77,8 +77,8 @@ pub struct Next {
     pub job: JobId,
     /// The task.
     pub task: TaskId,
-    /// Whether it is a duplicate attempt beside a slow worker.
-    pub beside: bool,
+    /// Whether it is a second attempt beside a slow worker.
+    pub is_second: bool,
 }
 
 /// A waiting task.
@@ -137,17 +137,17 @@ impl Queue {
                 known.leases = known.leases.saturating_sub(1);
                 self.given.remove(&call);
             }
-            let kind = record.task.stage;
+            let stage = record.task.stage;
             let pace_ms = record.pace_ms();
             let before_ms = match pace_ms {
                 Some(pace_ms) => known.paces_ms.insert(record.task, pace_ms),
                 None => known.paces_ms.remove(&record.task),
             };
             if before_ms != pace_ms {
-                stages_done.insert(kind);
+                stages_done.insert(stage);
             }
             if known.ready.remove(&record.task).is_some()
-                && let Some(count) = known.stages.get_mut(&kind)
+                && let Some(count) = known.stages.get_mut(&stage)
             {
                 *count = count.saturating_sub(1);
             }
@@ -156,14 +156,14 @@ impl Queue {
                     let failed_on = record.failed_on.clone();
                     let waiting = Waiting { need: record.need(), not_before_ms: *not_before_ms, failed_on };
                     known.ready.insert(record.task, waiting);
-                    *known.stages.entry(kind).or_default() += 1;
+                    *known.stages.entry(stage).or_default() += 1;
                 }
                 TaskState::Leased(first) => {
                     let calls: Vec<Call> = record.running().map(Call::of).collect();
                     for call in &calls {
                         self.given.insert(call.clone(), (job.job_id.clone(), record.task));
                     }
-                    let alone = record.may_have_rival().then(|| Alone {
+                    let alone = record.may_have_second_attempt().then(|| Alone {
                         need: record.need(),
                         failed_on: record.failed_on.clone(),
                         since_ms: first.since_ms,
@@ -175,8 +175,8 @@ impl Queue {
                 _ => {}
             }
         }
-        for kind in stages_done {
-            known.look_for_usual_pace(kind);
+        for stage in stages_done {
+            known.look_for_usual_pace(stage);
         }
     }
 
@@ -204,9 +204,9 @@ impl Queue {
         now_ms: u64,
         rules: &Rules,
     ) -> Option<Next> {
-        let is_taken = |kind: &Stage, count: &usize| *count > 0 && worker.stages.contains(kind);
+        let is_taken = |stage: &Stage, count: &usize| *count > 0 && worker.stages.contains(stage);
         let waits = |job: &OpenJob| {
-            job.stages.iter().any(|(kind, count)| is_taken(kind, count)) && !job.is_at_its_limit()
+            job.stages.iter().any(|(stage, count)| is_taken(stage, count)) && !job.is_at_its_limit()
         };
         let waiting = self.in_turn(worker, waits, &quota_of);
         let ready = waiting.into_iter().find_map(|(id, job)| {
@@ -215,7 +215,7 @@ impl Queue {
                     && may_take(&job.tenant, waiting.need, &waiting.failed_on, worker, peers)
             };
             let (task, _) = job.ready.iter().find(|(_, waiting)| may_go(waiting))?;
-            Some(Next { job: id.clone(), task: *task, beside: false })
+            Some(Next { job: id.clone(), task: *task, is_second: false })
         });
         ready.or_else(|| {
             let has_slow = |job: &OpenJob| job.slow(now_ms, rules).next().is_some() && !job.is_at_its_limit();
@@ -225,7 +225,7 @@ impl Queue {
                         && may_take(&job.tenant, alone.need, &alone.failed_on, worker, peers)
                 };
                 let (task, ..) = job.slow(now_ms, rules).find(|(_, leased, alone)| may_go(leased, alone))?;
-                Some(Next { job: id.clone(), task, beside: true })
+                Some(Next { job: id.clone(), task, is_second: true })
             })
         })
     }

@@ -21,7 +21,7 @@ pub struct Rules {
     /// The default quota of tenants. Default: no limits.
     pub quota: Quota,
     /// An attempt is slow if it takes this many times longer than its siblings took: an idle worker then
-    /// starts a duplicate attempt. 0 disables it. Default 3.
+    /// starts a second attempt. 0 disables it. Default 3.
     pub straggler_factor: f64,
     /// Minimum age of a slow attempt, milliseconds. Default 600 000.
     pub straggler_after_ms: u64,

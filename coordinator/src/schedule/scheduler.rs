@@ -64,7 +64,7 @@ fn successors(shape: &JobShape, task: TaskId) -> Vec<TaskId> {
 pub fn step(rows: &mut JobRows, event: Event, now_ms: u64, rules: &Rules) -> Result<Outcome, Refusal> {
     let mut events = Vec::new();
     match event {
-        Event::Claim { task, worker, peers, request_id, fence, beside } => {
+        Event::Claim { task, worker, peers, request_id, fence, is_second } => {
             match rows.job.state {
                 JobState::Running => {}
                 JobState::Paused => return Err(Refusal::JobPaused),
@@ -77,8 +77,8 @@ pub fn step(rows: &mut JobRows, event: Event, now_ms: u64, rules: &Rules) -> Res
             }
             let record = rows.tasks.get_mut(&task).ok_or(Refusal::NoSuchTask(task))?;
             match &record.state {
-                TaskState::Ready { not_before_ms } if !beside && rules.is_due(*not_before_ms, now_ms) => {}
-                TaskState::Leased(slow) if beside && record.may_have_rival() => {
+                TaskState::Ready { not_before_ms } if !is_second && rules.is_due(*not_before_ms, now_ms) => {}
+                TaskState::Leased(slow) if is_second && record.may_have_second_attempt() => {
                     if slow.incarnation == worker.incarnation {
                         return Err(Refusal::Unfit(task));
                     }
@@ -100,11 +100,12 @@ pub fn step(rows: &mut JobRows, event: Event, now_ms: u64, rules: &Rules) -> Res
                 resumed_from: record.checkpoint.as_ref().map_or(0, |c| c.iteration),
                 memory_bytes: worker.memory_bytes,
             };
-            let why = if beside { format!("beside {}, which is slow", record.worker) } else { String::new() };
+            let why =
+                if is_second { format!("beside {}, which is slow", record.worker) } else { String::new() };
             events.push(attempt_event(task, &attempt, TaskChange::Leased, &why));
-            if beside {
-                record.rivals += 1;
-                record.rival = Some(Box::new(attempt));
+            if is_second {
+                record.second_attempts += 1;
+                record.second = Some(Box::new(attempt));
             } else {
                 (record.worker, record.resumed_from) = (attempt.worker.clone(), attempt.resumed_from);
                 record.become_state(TaskState::Leased(attempt));
@@ -138,7 +139,7 @@ pub fn step(rows: &mut JobRows, event: Event, now_ms: u64, rules: &Rules) -> Res
             held(rows, &lease, rules)?;
             let message = match why {
                 Expired::Silent => "lease expired: its worker stopped renewing",
-                Expired::Stalled => "lease revoked: its worker is alive but makes no progress",
+                Expired::Stalled => "lease expired: its worker is alive but makes no progress",
             };
             give_back(rows, &lease, Some(FailClass::Environment), message, now_ms, rules, &mut events);
         }
@@ -406,7 +407,7 @@ fn retry(rows: &mut JobRows, now_ms: u64, events: &mut Vec<EventBody>) {
     let of_stage = job.shape.tasks_of(job.stage);
     job.open_tasks = 0;
     for record in rows.tasks.values_mut().filter(|record| !matches!(record.state, TaskState::Done { .. })) {
-        (record.errors, record.losses, record.rivals) = (0, 0, 0);
+        (record.errors, record.losses, record.second_attempts) = (0, 0, 0);
         record.failed_on.clear();
         record.state = if of_stage.contains(&record.task) {
             job.open_tasks += 1;

@@ -4,7 +4,7 @@
 //! Merges find lost results of partitions. A user pauses and resumes jobs, limits their workers, and retries
 //! failed jobs.
 //!
-//! Workers that find no ready task start duplicate attempts, as if the others were slow.
+//! Workers that find no ready task start second attempts, as if the others were slow.
 //!
 //! These properties are checked after every event:
 //! - No task is done twice, or with another result than the first one submitted under a running lease.
@@ -75,7 +75,7 @@ struct Simulation {
     /// The fence of each done task.
     done_under: BTreeMap<TaskId, u64>,
     /// Second attempts, and those of them that submitted the first result.
-    rivals: (u32, u32),
+    second_attempts: (u32, u32),
     done: BTreeMap<TaskId, BlobRef>,
     stale: u32,
     silent: u32,
@@ -128,7 +128,7 @@ impl Simulation {
             granted: BTreeMap::new(),
             running: BTreeMap::new(),
             done_under: BTreeMap::new(),
-            rivals: (0, 0),
+            second_attempts: (0, 0),
             done: BTreeMap::new(),
             stale: 0,
             silent: 0,
@@ -247,8 +247,8 @@ impl Simulation {
         match event {
             Event::Checkpoint { .. } => {}
             Event::Complete { .. } => {
-                let beside = self.running.iter().any(|(other, of)| *of == task && *other < fence);
-                self.rivals.1 += u32::from(beside);
+                let is_second = self.running.iter().any(|(other, of)| *of == task && *other < fence);
+                self.second_attempts.1 += u32::from(is_second);
                 self.running.retain(|_, of| *of != task);
                 self.done_under.insert(task, fence);
             }
@@ -268,8 +268,8 @@ impl Simulation {
     fn claim(&mut self) {
         let ready = |t: &&TaskRecord| matches!(t.state, TaskState::Ready { not_before_ms } if not_before_ms <= self.now_ms);
         let ready = self.rows.tasks.values().find(ready);
-        let beside = ready.is_none();
-        let alone = |t: &&TaskRecord| t.may_have_rival();
+        let is_second = ready.is_none();
+        let alone = |t: &&TaskRecord| t.may_have_second_attempt();
         let Some(task) = ready.or_else(|| self.rows.tasks.values().find(alone)).map(|t| t.task) else {
             return;
         };
@@ -281,7 +281,7 @@ impl Simulation {
             peers: Arc::default(),
             request_id: format!("request {fence}"),
             fence,
-            beside,
+            is_second,
         };
         let (state, leased) = (self.rows.job.state, self.leased());
         self.apply(event);
@@ -299,7 +299,7 @@ impl Simulation {
         if self.granted.insert(task, fence).is_some_and(|older| older >= fence) {
             self.violations.push(format!("fence {fence} of {task} does not rise"));
         }
-        self.rivals.0 += u32::from(beside);
+        self.second_attempts.0 += u32::from(is_second);
         self.running.insert(fence, task);
         self.leases.grant(lease.clone(), self.now_ms, self.now_ms + LEASE_MS);
         self.live(lease);
@@ -508,7 +508,7 @@ fn thousands_of_seeds_commit_each_task_once_by_a_live_lease() {
 
 fn simulate(seeds: u32) {
     let (mut stale, mut silent, mut succeeded, mut exchanged, mut bordered) = (0, 0, 0, 0, 0);
-    let (mut pauses, mut retries, mut rivals, mut ahead, mut lost) = (0, 0, 0, 0, 0);
+    let (mut pauses, mut retries, mut second_attempts, mut ahead, mut lost) = (0, 0, 0, 0, 0);
     for seed in 0..seeds {
         let end = Simulation::new(seed, false).run();
         assert!(end.violations.is_empty(), "seed {seed}: {:?}", end.violations);
@@ -516,9 +516,9 @@ fn simulate(seeds: u32) {
         silent += end.silent;
         pauses += end.pauses;
         retries += end.retries;
-        rivals += end.rivals.0;
+        second_attempts += end.second_attempts.0;
         lost += end.lost;
-        ahead += end.rivals.1;
+        ahead += end.second_attempts.1;
         exchanged += u32::from(end.rows.job.output(Artifact::Exchange).is_some());
         bordered += u32::from(end.done.contains_key(&Stage::Borders.task()));
         succeeded += u32::from(end.rows.job.state == JobState::Succeeded);
@@ -531,8 +531,8 @@ fn simulate(seeds: u32) {
         "{stale} stale messages, {silent} silent workers in {seeds} runs"
     );
     assert!(
-        rivals > seeds && ahead > seeds / 4,
-        "{rivals} second attempts, {ahead} of them first to a result"
+        second_attempts > seeds && ahead > seeds / 4,
+        "{second_attempts} second attempts, {ahead} of them first to a result"
     );
     assert!(lost > seeds / 10, "only {lost} results were lost");
     assert!(pauses > seeds && retries > seeds / 10, "{pauses} pauses, {retries} retries");
@@ -560,7 +560,7 @@ fn a_late_repeated_checkpoint_does_not_set_its_task_back() {
     let take = |rows: &mut JobRows, fence: u64| {
         let (worker, peers, request_id) = (worker(fence), Arc::default(), format!("request {fence}"));
         let event =
-            Event::Claim { task: Stage::Plan.task(), worker, peers, request_id, fence, beside: false };
+            Event::Claim { task: Stage::Plan.task(), worker, peers, request_id, fence, is_second: false };
         step(rows, event, 0, &Rules::default()).unwrap();
         rows.tasks[&Stage::Plan.task()].leases(&rows.job.job_id).remove(0)
     };

@@ -1,4 +1,4 @@
-//! Stragglers: attempts that take much longer than their siblings. An idle worker starts a duplicate attempt,
+//! Stragglers: attempts that take much longer than their siblings. An idle worker starts a second attempt,
 //! because a machine may be slow without being silent.
 //!
 //! The measure is the time per iteration, from claim to result; iterations represent the size of a partition,
@@ -9,7 +9,7 @@ use super::rows::Rules;
 use super::task::{Attempt, TaskRecord, TaskState};
 
 /// Maximum second attempts of a task, until it is requeued or its job is retried.
-const MOST_RIVALS: u32 = 1;
+const MAX_SECOND_ATTEMPTS: u32 = 1;
 
 /// Whether the job has siblings to compare the task with.
 fn has_siblings(task: TaskId) -> bool {
@@ -18,9 +18,12 @@ fn has_siblings(task: TaskId) -> bool {
 
 impl TaskRecord {
     /// Whether a second attempt may start beside the running one.
-    pub fn may_have_rival(&self) -> bool {
+    pub fn may_have_second_attempt(&self) -> bool {
         let is_leased = matches!(self.state, TaskState::Leased(_));
-        is_leased && self.rival.is_none() && self.rivals < MOST_RIVALS && has_siblings(self.task)
+        is_leased
+            && self.second.is_none()
+            && self.second_attempts < MAX_SECOND_ATTEMPTS
+            && has_siblings(self.task)
     }
 
     /// Milliseconds that an iteration took, of a task with siblings that is done.
@@ -115,7 +118,7 @@ mod tests {
             tenant: None,
         };
         let (peers, request_id) = (Arc::default(), "d".to_owned());
-        let claim = Event::Claim { task, worker, peers, request_id, fence: 9, beside: true };
+        let claim = Event::Claim { task, worker, peers, request_id, fence: 9, is_second: true };
         assert!(step(&mut rows, claim, 1, &Rules::default()).is_ok());
         assert_eq!(named(&rows), [(3, 7), (4, 9)]);
         let blob = BlobRef { digest: "0".repeat(64), bytes: 1 };

@@ -10,7 +10,7 @@
 //!                             └── lease expired: losses + 1, pause ──────┘
 //!  from DONE: a disk has lost the result of a partition ──► READY, losses + 1; the merge that found it out ──► BLOCKED
 //!  from LEASED, when it is slow: a second worker takes it too (fence = next, attempt + 1); of the two, the first result is the
-//!  task's, and one that ends without leaves the task to the other: nothing is counted
+//!  task's, and an attempt that ends without a result leaves the task to the other: nothing is counted
 //!  from BLOCKED, READY, LEASED: the job ends ──► CANCELLED
 //! ```
 //!
@@ -70,7 +70,7 @@ pub enum TaskState {
         /// Earliest time of a claim, Unix milliseconds.
         not_before_ms: u64,
     },
-    /// A worker runs it; the record's `rival` may run too.
+    /// A worker runs it; the record's `second` may run too.
     Leased(Attempt),
     /// Its result is committed.
     Done {
@@ -167,11 +167,11 @@ pub struct TaskRecord {
     /// The fence of the attempt whose Complete, Fail or Release was applied last; it identifies a repeated
     /// call.
     pub returned_fence: u64,
-    /// The duplicate attempt beside a slow one; only of a leased task.
+    /// The second attempt beside a slow one; only of a leased task.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub rival: Option<Box<Attempt>>,
-    /// Number of rivals ever begun.
-    pub rivals: u32,
+    pub second: Option<Box<Attempt>>,
+    /// Number of second attempts ever begun.
+    pub second_attempts: u32,
     /// The worker that holds or last held the lease; of two, the one that began first.
     pub worker: String,
     /// Iteration at which that attempt began.
@@ -204,8 +204,8 @@ impl TaskRecord {
             losses: 0,
             fence: 0,
             returned_fence: 0,
-            rival: None,
-            rivals: 0,
+            second: None,
+            second_attempts: 0,
             worker: String::new(),
             resumed_from: 0,
             checkpoint: None,
@@ -213,10 +213,10 @@ impl TaskRecord {
         }
     }
 
-    /// The running attempts, the first one before its rival.
+    /// The running attempts, the first one before the second.
     pub fn running(&self) -> impl Iterator<Item = &Attempt> {
         let first = if let TaskState::Leased(attempt) = &self.state { Some(attempt) } else { None };
-        first.into_iter().chain(self.rival.as_deref())
+        first.into_iter().chain(self.second.as_deref())
     }
 
     /// The leases that are held on it.
@@ -250,12 +250,12 @@ impl TaskRecord {
 
     /// Removes the attempt under `fence` if another runs too, which then continues alone.
     pub(super) fn leave_to_other(&mut self, fence: u64) -> Option<Attempt> {
-        let rival = self.rival.take()?;
-        if rival.fence == fence {
-            return Some(*rival);
+        let second = self.second.take()?;
+        if second.fence == fence {
+            return Some(*second);
         }
-        (self.worker, self.resumed_from) = (rival.worker.clone(), rival.resumed_from);
-        match std::mem::replace(&mut self.state, TaskState::Leased(*rival)) {
+        (self.worker, self.resumed_from) = (second.worker.clone(), second.resumed_from);
+        match std::mem::replace(&mut self.state, TaskState::Leased(*second)) {
             TaskState::Leased(first) => Some(first),
             _ => None,
         }
@@ -263,7 +263,7 @@ impl TaskRecord {
 
     /// Ends all attempts.
     pub(super) fn become_state(&mut self, state: TaskState) {
-        self.rival = None;
+        self.second = None;
         self.state = state;
     }
 

@@ -243,7 +243,7 @@ fn task(record: &TaskRecord, live: Option<&LiveProgress>) -> v1::Task {
         last_errors: record.last_errors.clone(),
         seconds,
         memory_bytes: record.memory_bytes,
-        second_worker: record.rival.as_ref().map(|rival| rival.worker.clone()).unwrap_or_default(),
+        second_worker: record.second.as_ref().map(|second| second.worker.clone()).unwrap_or_default(),
     }
 }
 

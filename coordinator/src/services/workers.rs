@@ -191,9 +191,10 @@ impl Workers {
             tracing::warn!(job = %lease.job, task = %lease.task, attempt = lease.attempt, fence = lease.fence, %error, "result refused");
         }
         result?;
-        // Another worker may run a duplicate attempt, which stops.
-        let had_rival = self.0.jobs.task_row(&lease.job, lease.task).await.is_ok_and(|row| row.rivals > 0);
-        if had_rival {
+        // Another worker may run a second attempt, which stops.
+        let had_second_attempt =
+            self.0.jobs.task_row(&lease.job, lease.task).await.is_ok_and(|row| row.second_attempts > 0);
+        if had_second_attempt {
             self.0.wakeups.interrupted()
         } else {
             self.0.wakeups.changed()

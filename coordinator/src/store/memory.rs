@@ -158,7 +158,7 @@ impl JobStore for MemoryStore {
                         }
                         if slow.is_none()
                             && may_go(record)
-                            && record.may_have_rival()
+                            && record.may_have_second_attempt()
                             && first.incarnation != claim.worker.incarnation
                             && slow_from_ms(rows, record, first, &self.rules).is_some_and(|at| at <= now_ms)
                         {
@@ -174,7 +174,7 @@ impl JobStore for MemoryStore {
                 }
             }
         }
-        let beside = found.is_none();
+        let is_second = found.is_none();
         let Some((id, task)) = found.or(slow) else { return Ok(None) };
         state.last_fence += 1;
         let event = Event::Claim {
@@ -183,7 +183,7 @@ impl JobStore for MemoryStore {
             peers: claim.peers.clone(),
             request_id: claim.request_id.clone(),
             fence: state.last_fence,
-            beside,
+            is_second,
         };
         state.apply(&id, event, now_ms, &self.rules)?;
         let rows = state.jobs.get(&id).ok_or_else(|| StoreError::JobNotFound(id.clone()))?;

@@ -223,12 +223,12 @@ impl Levels {
         ready: &[ReadyTask],
         (leased, iterations_per_second): (BTreeMap<Stage, usize>, f64),
     ) -> Self {
-        let mut by_kind = BTreeMap::new();
+        let mut by_stage = BTreeMap::new();
         for task in ready {
-            *by_kind.entry(task.need.task.stage).or_default() += 1;
+            *by_stage.entry(task.need.task.stage).or_default() += 1;
         }
         let oldest_ready_ms = ready.iter().map(|task| task.not_before_ms).min();
-        Self { jobs, ready: by_kind, oldest_ready_ms, leased, iterations_per_second }
+        Self { jobs, ready: by_stage, oldest_ready_ms, leased, iterations_per_second }
     }
 }
 

@@ -89,7 +89,7 @@ fn faults_of_job(JobExport { job, tasks, events }: &JobExport) -> Vec<String> {
     let leased: usize = tasks.iter().map(|record| record.running().count()).sum();
     let ready = tasks.iter().filter(|record| matches!(record.state, TaskState::Ready { .. })).count();
     for record in tasks {
-        if record.rival.is_some() && !matches!(record.state, TaskState::Leased(_)) {
+        if record.second.is_some() && !matches!(record.state, TaskState::Leased(_)) {
             faults.push(format!("{} has a second worker and no first one", record.task));
         }
     }

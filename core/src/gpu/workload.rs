@@ -14,8 +14,8 @@ pub struct Workload {
     pub intersections: u32,
     /// Evaluations of every intersection at every pixel of its tile.
     pub listed_evaluations: u64,
-    /// Evaluations up to the last splat that any pixel of a tile needs before its ray ends. Without treating
-    /// pixels separately, no forward pass can do with fewer. The backward pass stops there.
+    /// Evaluations up to the last splat that some pixel of the tile needs: the least that any pass working
+    /// tile by tile can do. The backward pass stops there.
     pub needed_evaluations: u64,
 }
 

@@ -18,7 +18,7 @@ use crate::gpu::{Block, Gpu, sh_stride};
 
 /// The surroundings that a run continues with: which Gaussians it still trains, and what replaces its
 /// context.
-pub struct Beside<'a> {
+pub struct Surroundings<'a> {
     /// Whether a Gaussian with this mean (world axes) is still trained; the others are dropped.
     pub keeps: &'a dyn Fn([f32; 3]) -> bool,
     /// Frozen Gaussians: rendered, but not changed from here on.
@@ -27,7 +27,7 @@ pub struct Beside<'a> {
 
 impl Trainer {
     /// Continues the run from `state`, a checkpoint of `run`, with the water `medium` and the surroundings
-    /// `beside`, if given. `None` if nothing would be left to train.
+    /// `surroundings`, if given. `None` if nothing would be left to train.
     /// If nothing changes, the bytes equal those of the uninterrupted `run`. Nothing changes if `medium` is
     /// the water that the run has by then, fixed in both, and the context is the same.
     ///
@@ -39,11 +39,11 @@ impl Trainer {
         run: TrainRun,
         state: &[u8],
         medium: Option<MediumRun>,
-        beside: Option<Beside<'_>>,
+        surroundings: Option<Surroundings<'_>>,
     ) -> Result<Option<Self>> {
-        let mut trainer = match beside {
+        let mut trainer = match surroundings {
             None => Self::resume(gpu, run, state)?,
-            Some(beside) => match Self::go_on_beside(gpu, run, state, beside)? {
+            Some(surroundings) => match Self::go_on_beside(gpu, run, state, surroundings)? {
                 Some(trainer) => trainer,
                 None => return Ok(None),
             },
@@ -68,7 +68,7 @@ impl Trainer {
         gpu: Arc<Gpu>,
         run: TrainRun,
         state: &[u8],
-        Beside { keeps, context }: Beside<'_>,
+        Surroundings { keeps, context }: Surroundings<'_>,
     ) -> Result<Option<Self>> {
         let TrainRun { config, extent, views, surfaces, medium, .. } = &run;
         let (config, extent, views) = (config.clone(), *extent, Arc::clone(views));

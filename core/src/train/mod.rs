@@ -43,7 +43,7 @@ pub use crate::appearance::water::{
 };
 pub use crate::gpu::DevicePhotograph;
 pub use backward::{BackwardBuffers, record_backward, record_backward_in_bands};
-pub use handover::Beside;
+pub use handover::Surroundings;
 pub use held_out::HeldOutMetrics;
 pub use init::initial_gaussians;
 use lists::{lists, slot_gradients};
@@ -200,7 +200,7 @@ impl Trainer {
             appearances,
             predictor,
             surfaces,
-            targets: TargetImages::new(views, config.seed, config.prefetch_threads).gives_way(&gpu),
+            targets: TargetImages::new(views, config.seed, config.prefetch_threads).evictable_on(&gpu),
             initial: focus.len() as u32,
             gpu,
             config,

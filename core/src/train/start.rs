@@ -15,13 +15,13 @@ use crate::views::{Mapped, TrainView, ViewSource};
 use crate::water::{Water, four_digits, ray_maps, water_prior};
 
 /// Smallest initial coefficient, in 1 / scene scale.
-const LEAST: f64 = 2e-3;
+const LEAST_COEFFICIENT: f64 = 2e-3;
 /// Smallest initial colour at infinity, linear light: a third of an 8-bit code, so that it is invisible. With
 /// 2e-3, which is seven codes, no red of the far reef of reef-clip could be darker, which cost 0.002 of the
 /// SSIM of red.
 const LEAST_COLOUR: f64 = 1e-4;
 /// J of a point, linear light: not black, because it would have no gradient, and not brighter than white.
-const CLEAR: [f64; 2] = [2e-3, 1.0];
+const J_RANGE: [f64; 2] = [2e-3, 1.0];
 
 /// The start of a run with water.
 #[derive(Clone, Debug)]
@@ -132,7 +132,7 @@ pub fn starting_water(
         .zip(clear)
         .map(|(colour, clear)| as_code(clear.unwrap_or_else(|| without(&medium.water, *colour, unit))));
     let colours = colours.collect();
-    let medium = medium.over_what_is_behind();
+    let medium = medium.over_black_if_clear();
     Ok(Some(StartingWater { medium, points: Points { colours, ..points.clone() } }))
 }
 
@@ -159,7 +159,7 @@ pub fn clear_points(medium: &MediumRun, points: &Points, views: &[TrainView], sc
 
 /// J as the 8-bit sRGB colour of a point.
 fn as_code(clear: [f64; 3]) -> [u8; 3] {
-    clear.map(|light| (linear_to_srgb(light.clamp(CLEAR[0], CLEAR[1])) * 255.0).round() as u8)
+    clear.map(|light| (linear_to_srgb(light.clamp(J_RANGE[0], J_RANGE[1])) * 255.0).round() as u8)
 }
 
 /// J of an 8-bit sRGB colour seen at `range`, linear light.
@@ -168,10 +168,10 @@ fn without(water: &Water, colour: [u8; 3], range: f64) -> [f64; 3] {
     water.remove(seen, range).to_array()
 }
 
-/// `water` with values of at least [`LEAST`] and [`LEAST_COLOUR`]: at 0 the unconstrained parameters have no
-/// gradient, so they could not grow.
+/// `water` with values of at least [`LEAST_COEFFICIENT`] and [`LEAST_COLOUR`]: at 0 the unconstrained
+/// parameters have no gradient, so they could not grow.
 pub(super) fn able_to_move(water: Water, unit: f64) -> Water {
-    let least = |beta: [f64; 3]| beta.map(|value| value.max(LEAST / unit));
+    let least = |beta: [f64; 3]| beta.map(|value| value.max(LEAST_COEFFICIENT / unit));
     Water {
         beta_d: least(water.beta_d),
         beta_b: least(water.beta_b),

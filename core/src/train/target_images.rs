@@ -39,7 +39,7 @@ impl TargetImages {
     }
 
     /// Lets the photographs kept on a device be dropped when its memory runs short.
-    pub(super) fn gives_way(self, gpu: &Gpu) -> Self {
+    pub(super) fn evictable_on(self, gpu: &Gpu) -> Self {
         gpu.give_way(&self.resident);
         self
     }
@@ -107,10 +107,10 @@ impl TargetImages {
 /// A comb of even spacing is laid over the cumulative weights, starting at `offset` (0 to 1) of one spacing.
 /// Over all offsets, the mean count of each index equals its share. Equal weights give every index once.
 fn systematic_sample(weights: &[f32], offset: f64) -> Vec<u32> {
-    let tooth = weights.iter().map(|&weight| f64::from(weight)).sum::<f64>() / weights.len().max(1) as f64;
+    let spacing = weights.iter().map(|&weight| f64::from(weight)).sum::<f64>() / weights.len().max(1) as f64;
     let (mut index, mut reached) = (0, weights.first().map_or(0.0, |&first| f64::from(first)));
-    let drawn = (0..weights.len()).map(|tine| {
-        let at = (tine as f64 + offset) * tooth;
+    let drawn = (0..weights.len()).map(|draw| {
+        let at = (draw as f64 + offset) * spacing;
         while at >= reached && index + 1 < weights.len() {
             index += 1;
             reached += f64::from(weights[index]);

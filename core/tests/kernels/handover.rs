@@ -5,7 +5,7 @@ use std::sync::Arc;
 use fathom_core::CoreError;
 use fathom_core::config::{Composition, Moments, TrainConfig, WaterConfig};
 use fathom_core::gaussians::Gaussians;
-use fathom_core::train::{Beside, MediumRun, TrainRun, Trainer};
+use fathom_core::train::{MediumRun, Surroundings, TrainRun, Trainer};
 use fathom_core::views::InMemory;
 use fathom_core::water::Water;
 
@@ -129,8 +129,8 @@ fn a_run_continues_with_the_kept_gaussians_beside_new_context() {
         whole.advance(ITERATIONS).unwrap();
         let whole = whole.gaussians().unwrap();
         let hand_over = |keeps: &dyn Fn([f32; 3]) -> bool, context: Gaussians| {
-            let beside = Some(Beside { keeps, context });
-            Trainer::hand_over(Arc::clone(&gpu), new(), &state, None, beside).unwrap()
+            let surroundings = Some(Surroundings { keeps, context });
+            Trainer::hand_over(Arc::clone(&gpu), new(), &state, None, surroundings).unwrap()
         };
 
         // All Gaussians stay without a context: the run continues to the bit.

@@ -219,7 +219,7 @@ impl DiskStore {
         for (lease, _) in &leased {
             of_tenant += u32::from(self.memory.job_row(&lease.job).await?.tenant == grant.job.tenant);
         }
-        let is_second = grant.task.rival.as_ref().is_some_and(|rival| rival.fence == grant.lease.fence);
+        let is_second = grant.task.second.as_ref().is_some_and(|second| second.fence == grant.lease.fence);
         self.world.counts(|counts| counts.second_attempts += u64::from(is_second));
         let before = {
             let mut fences = self.fences();

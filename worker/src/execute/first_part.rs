@@ -13,7 +13,7 @@ use bytes::Bytes;
 use fathom_core::exchange::Exchange;
 use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::Gpu;
-use fathom_core::train::{Beside, MediumRun, TrainRun, Trainer};
+use fathom_core::train::{MediumRun, Surroundings, TrainRun, Trainer};
 use fathom_core::views::ViewSource;
 use fathom_core::water::{Water, four_digits};
 use fathom_core::{CoreError, ply};
@@ -149,7 +149,7 @@ fn restore(
         |mean: [f32; 3]| cell.as_ref().is_none_or(|cell| cell.contains(DVec3::from(mean.map(f64::from))));
     let beside = match &cell {
         None => None,
-        Some(_) => Some(Beside { keeps: &keeps, context: context_of_neighbours(task, spec, own)? }),
+        Some(_) => Some(Surroundings { keeps: &keeps, context: context_of_neighbours(task, spec, own)? }),
     };
     match Trainer::hand_over(Arc::clone(gpu), first_run(task, own)?, &state, frozen.cloned(), beside) {
         Ok(Some(trainer)) => {

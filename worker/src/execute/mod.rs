@@ -34,7 +34,7 @@ use crate::views::{PhotographFile, PhotographSource};
 /// Layout version of [`TaskSpec`] that this program reads.
 pub const SPEC_FORMAT: u32 = 2;
 
-/// Stages that this worker executes. A stage is a row here, an arm of [`CoreExecutor::run`], and a file.
+/// Stages that this worker executes. A stage is a row here, an arm of `CoreExecutor::run`, and a file.
 pub const STAGES: [Stage; 5] =
     [Stage::Global, Stage::FirstPart, Stage::Partition, Stage::Borders, Stage::Evaluate];
 

@@ -1,4 +1,4 @@
-//! A second worker starts a duplicate attempt at a slow task.
+//! A second worker starts a second attempt at a slow task.
 
 use super::*;
 use crate::schedule::FailClass;
@@ -47,7 +47,7 @@ pub async fn a_slow_task_gets_a_second_worker_and_the_first_result_counts(store:
     let late = T0 + 30 + PATIENCE_MS;
     assert!(second(store, "early", late - 1).await.is_none(), "a task was taken twice before its time");
     let own = store.claim(&claim_as("slow", "another call", &[Stage::Partition]), late).await.unwrap();
-    assert!(own.is_none(), "a worker got a duplicate attempt beside its own");
+    assert!(own.is_none(), "a worker got a second attempt beside its own");
     let fast = second(store, "fast", late).await.expect("the straggler");
     assert_eq!((fast.lease.task, fast.lease.attempt), (Stage::Partition.task_of(0), 2));
     assert!(fast.lease.fence > slow.fence);

@@ -176,7 +176,7 @@ impl SledStore {
         }
         let quota_of = |tenant: &Tenant| live.quotas.get(tenant).copied().unwrap_or(self.rules.quota);
         let next = live.queue.next(&claim.worker, &claim.peers, quota_of, now_ms, &self.rules);
-        let Some(Next { job: id, task, beside }) = next else { return Ok(None) };
+        let Some(Next { job: id, task, is_second }) = next else { return Ok(None) };
         let event = Event::Claim {
             task,
             worker: claim.worker.clone(),
@@ -184,7 +184,7 @@ impl SledStore {
             request_id: claim.request_id.clone(),
             // Numbered in the transaction.
             fence: 0,
-            beside,
+            is_second,
         };
         let (_, rows) = self.apply_event(&mut live, &id, &event, now_ms)?;
         let record = rows.tasks.get(&task).cloned();

@@ -127,7 +127,7 @@ impl MediumRun {
 
     /// Blends over black if the water is clear and the configuration allows it (`water.clear_over_black`).
     #[must_use]
-    pub(crate) fn over_what_is_behind(mut self) -> Self {
+    pub(crate) fn over_black_if_clear(mut self) -> Self {
         let may_be = self.config.clear_over_black && !self.config.has_dark_channel();
         if may_be && self.composition == Composition::PixelsSrgb && self.is_clear() {
             self.composition = Composition::PixelsOverBlack;
@@ -265,7 +265,7 @@ mod tests {
         let of = |beta: f64, config: WaterConfig, composition: Composition| {
             let water = Water { beta_d: [9.0, beta, 0.1 * beta], ..Water::COASTAL };
             MediumRun { water, ..MediumRun::fixed(&config, composition, 7.0) }
-                .over_what_is_behind()
+                .over_black_if_clear()
                 .composition
         };
         let default = WaterConfig::default;
@@ -338,7 +338,7 @@ mod tests {
         let run = MediumRun { water, ..MediumRun::fixed(&config, over_black, 7.0) };
         let weights = [run.background_weight(), run.surface_weight(), run.saturation_weight()];
         assert_eq!((weights, run.harmonics_lr_scale()), ([0.0; 3], config.clear_harmonics));
-        assert_eq!(run.over_what_is_behind().composition, over_black);
+        assert_eq!(run.over_black_if_clear().composition, over_black);
     }
 
     #[test]

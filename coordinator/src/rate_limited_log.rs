@@ -11,9 +11,9 @@ pub const LOG_EVERY: Duration = Duration::from_secs(60);
 
 /// Counts events, and decides when a line is due.
 #[derive(Debug, Default)]
-pub struct Seldom(Mutex<(u64, Option<Instant>)>);
+pub struct RateLimitedLog(Mutex<(u64, Option<Instant>)>);
 
-impl Seldom {
+impl RateLimitedLog {
     /// Counts one more; returns the number since the last line when another is due.
     pub fn count(&self) -> Option<u64> {
         let now = Instant::now();
@@ -34,10 +34,10 @@ mod tests {
 
     #[tokio::test(start_paused = true)]
     async fn many_in_a_minute_make_one_line_that_counts_them() {
-        let seldom = Seldom::default();
-        let logged: Vec<_> = (0..1000).map(|_| seldom.count()).collect();
+        let log = RateLimitedLog::default();
+        let logged: Vec<_> = (0..1000).map(|_| log.count()).collect();
         assert_eq!((logged[0], logged[1..].iter().flatten().count()), (Some(1), 0));
         tokio::time::advance(LOG_EVERY).await;
-        assert_eq!((seldom.count(), seldom.count()), (Some(1000), None));
+        assert_eq!((log.count(), log.count()), (Some(1000), None));
     }
 }
