@@ -144,7 +144,7 @@ async fn one_partition_exchanges_nothing_and_the_user_is_warned() {
     endless.water.freeze_at = 1.0;
     let request = cluster.request_with(&cluster.manifest, "endless", &endless).await;
     let refused = cluster.jobs().create_job(request).await.unwrap_err();
-    assert!(refused.message().contains("water.freeze_at below 1"), "{refused:?}");
+    assert!(refused.message().contains("water.start_at < water.freeze_at < 1"), "{refused:?}");
 }
 
 /// A job with this many columns whose borders are trained.

@@ -16,7 +16,7 @@ const SLACK: Duration = Duration::from_millis(1500);
 /// Slow enough that a photograph or a checkpoint takes a second or more, bytes per second.
 const SLOW: u64 = 100_000;
 /// Longest delay of a kill after a checkpoint, milliseconds. A kill between two tasks is repeated sooner.
-const STRIKES_WITHIN: [u64; 3] = [600, 300, 150];
+const STRIKES_WITHIN: [u64; 5] = [600, 300, 150, 75, 30];
 
 /// The partition that its first worker did not finish, and its leases. A fast machine has finished one and
 /// started the other.
