@@ -3,7 +3,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .ONESHELL:
 .DEFAULT_GOAL := help
-.PHONY: help setup build demo test check settings traces fuzz simulate soak bench accept ablation dist release-protos
+.PHONY: help setup build demo test check settings drivers traces fuzz simulate soak bench accept ablation dist release-protos
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /  make \1	/' | expand -t 20
@@ -18,16 +18,20 @@ demo: build ## trains a synthetic wreck with two workers in 2x2 partitions, with
 	@scripts/demo.sh
 
 test: setup ## every test; those that need a GPU run on Mesa's CPU driver
-	@cargo test --workspace
+	@scripts/drivers.sh fetch || true
+	cargo test --workspace
 
 check: ## formatting, lints, documentation, shaders, protos, tidiness; CI runs this before the tests
 	@cargo fmt --all --check
 	cargo clippy --workspace --all-targets -- -D warnings
 	RUSTDOCFLAGS="-D warnings" cargo doc --workspace --no-deps
-	cargo test --workspace --test shaders_validate --test compatible --test tidy
+	cargo test --workspace --test shaders_validate --test languages --test compatible --test tidy
 
 settings: ## docs/using/settings.md and the example files in deploy/, from the settings in the source
 	@FATHOM_WRITE_SETTINGS=1 cargo test --workspace --bin fathom settings_page_and_example_files_are_current
+
+drivers: ## kernels, a short training and the validation layer on every driver that a CPU runs; 25 minutes on 2 cores
+	@scripts/drivers.sh
 
 traces: ## builds the feature `otel`, which CI does not, and tests that spans arrive at a collector; 6 minutes on 2 cores
 	@cargo test -p fathom-cli --features otel --test traces

@@ -47,6 +47,16 @@ pub const STAGED_BYTES: u64 = 128 << 20;
 pub const BATCH: u32 = 16;
 /// Gaussians in a full block, the unit of reading back.
 pub const BLOCK_CAPACITY: u32 = 512 * 1024;
+
+/// Gaussians in a full block that is trained with these moments. In f32 the moments of the coefficients are
+/// one array of twice the coefficients' size.
+pub fn block_capacity(moments: Moments) -> u32 {
+    match moments {
+        Moments::Compact => BLOCK_CAPACITY,
+        Moments::F32 => BLOCK_CAPACITY / 2,
+    }
+}
+
 /// Maximum number of tiles processed at once, in a strip of a picture or a band of a view. With tiles of 16 x
 /// 16, their colours take 128 MiB, the smallest maximum binding size of devices; a picture of 3840 x 2160 has
 /// fewer tiles. With tiles of 8 x 8, on CPU adapters, it is the largest power of two that a splat can cover.
@@ -224,8 +234,10 @@ impl RunSize<'_> {
         let pixels = self.pictures.iter().map(area).max().unwrap_or(0);
         let photograph = pixels * PHOTOGRAPH_BYTES;
         let views = self.pictures.len() as u64;
-        let read_back = self.trained.min(BLOCK_CAPACITY.into())
-            * coefficient_bytes(config.sh_degree).max(transform_moment_bytes(config.moments));
+        let colour = coefficient_bytes(config.sh_degree);
+        let of_colour = if config.moments == Moments::F32 { 2 * colour } else { colour };
+        let read_back = self.trained.min(block_capacity(config.moments).into())
+            * of_colour.max(transform_moment_bytes(config.moments));
         let uploaded = (photograph * views.min(BATCH.into())).min(STAGED_BYTES.max(photograph));
         let copy = self.trained * (frozen_bytes + FLAG_BYTES)
             + visible * VISIBLE_BYTES

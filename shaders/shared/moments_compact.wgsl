@@ -3,8 +3,8 @@
 //
 //   moments     [N*4]  vec4<u32>: 11 pairs in the order of the transform (first moment in the low half,
 //                      root of the second in the high half), then as f32: second moments of red, green and
-//                      blue, and the scale of sh_moment1
-//   sh_moment1  [N*S]  vec2<u32>: four snorm16, laid out as sh_coeffs, in units of the scale
+//                      blue, and the scale of sh_moments
+//   sh_moments  [N*S]  vec2<u32>: four snorm16, laid out as sh_coeffs, in units of the scale
 //
 // Moments of the transform are stored as logarithms, because their sizes differ by many powers of ten between
 // parameters, scenes and Gaussians. What matters is the relative error: at most 0.14 % and 0.07 %.
@@ -15,7 +15,7 @@
 // constant colour it is exactly Adam's own.
 
 @group(0) @binding(10) var<storage, read_write> moments: array<vec4<u32>>;
-@group(0) @binding(11) var<storage, read_write> sh_moment1: array<vec2<u32>>;
+@group(0) @binding(11) var<storage, read_write> sh_moments: array<vec2<u32>>;
 
 // The levels cover 2^-64 to 2^64.
 const LOWEST: f32 = -64.0;
@@ -50,7 +50,7 @@ fn keep_gradients(i: u32, d0: vec4<f32>, d1: vec4<f32>, d2: vec4<f32>) {}
 fn keep_colour_gradient(n: u32, gradient: vec4<f32>) {}
 
 // State of the current Gaussian: second moments of the channels, the factor on first moments, and the scales
-// of sh_moment1.
+// of sh_moments.
 var<private> second: vec3<f32>;
 var<private> per_channel: vec3<f32>;
 var<private> scale_before: f32;
@@ -69,11 +69,11 @@ fn begin_colour(i: u32, v_rgb: vec3<f32>, most: f32, pace: Pace) {
 }
 
 fn colour_step(n: u32, part: u32, gradient: vec4<f32>, rate: vec4<f32>, pace: Pace) -> vec4<f32> {
-    let words = sh_moment1[n];
+    let words = sh_moments[n];
     let before = old(scale_before * vec4<f32>(unpack2x16snorm(words.x), unpack2x16snorm(words.y)), pace);
     let m = moved(BETA1, before, gradient);
     let shares = m * select(0.0, 1.0 / scale_after, scale_after > 0.0);
-    sh_moment1[n] = vec2<u32>(pack2x16snorm(shares.xy), pack2x16snorm(shares.zw));
+    sh_moments[n] = vec2<u32>(pack2x16snorm(shares.xy), pack2x16snorm(shares.zw));
     // Four coefficients of three channels lie in three vectors.
     let p = per_channel;
     let channels = select(select(p.zxyz, p.yzxy, part == 1u), p.xyzx, part == 0u);

@@ -2,11 +2,12 @@
 // coefficients. Needs adam.wgsl.
 //
 //   moments     [N*6]  vec4: first, then second moments of the transform
-//   sh_moment1, sh_moment2 [N*S]  vec4, laid out as sh_coeffs
+//   sh_moments  [N*S*2] vec4: first and second moment of each vec4 of sh_coeffs, one after the other. One
+//               array for
+//                       both: some adapters allow a kernel 10 storage buffers
 
 @group(0) @binding(10) var<storage, read_write> moments: array<vec4<f32>>;
-@group(0) @binding(11) var<storage, read_write> sh_moment1: array<vec4<f32>>;
-@group(0) @binding(12) var<storage, read_write> sh_moment2: array<vec4<f32>>;
+@group(0) @binding(11) var<storage, read_write> sh_moments: array<vec4<f32>>;
 
 // Whether raw gradients are stored instead of first moments, and no step is taken (tests).
 fn keeps_gradients() -> bool {
@@ -20,7 +21,7 @@ fn keep_gradients(i: u32, d0: vec4<f32>, d1: vec4<f32>, d2: vec4<f32>) {
 }
 
 fn keep_colour_gradient(n: u32, gradient: vec4<f32>) {
-    sh_moment1[n] = gradient;
+    sh_moments[2u * n] = gradient;
 }
 
 // Called before and after the coefficients of a Gaussian; nothing to do here.
@@ -29,10 +30,10 @@ fn end_colour(i: u32) {}
 
 // The step to subtract from vec4 n of the coefficients; `part` (0, 1, 2) says which channels it holds.
 fn colour_step(n: u32, part: u32, gradient: vec4<f32>, rate: vec4<f32>, pace: Pace) -> vec4<f32> {
-    let m = moved(BETA1, old(sh_moment1[n], pace), gradient);
-    let v = moved(BETA2, old(sh_moment2[n], pace), gradient * gradient);
-    sh_moment1[n] = m;
-    sh_moment2[n] = v;
+    let m = moved(BETA1, old(sh_moments[2u * n], pace), gradient);
+    let v = moved(BETA2, old(sh_moments[2u * n + 1u], pace), gradient * gradient);
+    sh_moments[2u * n] = m;
+    sh_moments[2u * n + 1u] = v;
     return rate * (m * pace.unbias.x) / (sqrt(v * pace.unbias.y) + EPSILON);
 }
 

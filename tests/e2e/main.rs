@@ -6,6 +6,7 @@
 mod access;
 mod command_line;
 mod datasets;
+mod drivers;
 #[cfg(unix)]
 mod faults;
 mod held_out;

@@ -1,8 +1,8 @@
 //! Gaussians on the device, in blocks.
 //!
-//! A block holds at most [`BLOCK_CAPACITY`] Gaussians, so that none of its arrays exceeds the smallest
-//! storage binding of 128 MiB (the coefficients of SH degree 3 take 96). A model has up to [`MAX_BLOCKS`]
-//! blocks.
+//! A block holds at most [`BLOCK_CAPACITY`] Gaussians, and half as many with moments in f32
+//! ([`block_capacity`]). None of its arrays then exceeds the smallest storage binding of 128 MiB (the
+//! coefficients of SH degree 3 take 96). A model has up to [`MAX_BLOCKS`] blocks.
 //! Only the flags of all Gaussians (`Frame`) share one binding, 4 bytes each. Bindings of 128 MiB allow 33
 //! million Gaussians; beyond that there is a typed error.
 //! Trainable blocks come first, then frozen ones. Blocks are filled in order: all but the last trainable one
@@ -18,7 +18,7 @@ use crate::gaussians::{Gaussians, Transform};
 use crate::memory::FLAG_BYTES;
 use crate::{CoreError, Result};
 
-pub use crate::memory::BLOCK_CAPACITY;
+pub use crate::memory::{BLOCK_CAPACITY, block_capacity};
 
 /// Number of vec4 for the coefficients of one Gaussian: three for every four of the K coefficients.
 pub fn sh_stride(sh_degree: u8) -> u32 {
@@ -31,38 +31,28 @@ pub fn sh_stride(sh_degree: u8) -> u32 {
 pub struct BlockTraining {
     /// `[N*4]` or, in f32, `[N*6]` vec4: moments of the transforms; see `shaders/shared/moments_*.wgsl`.
     pub moments: wgpu::Buffer,
-    /// First moments of the coefficients: half the size of the coefficients, or the same size in f32.
-    pub sh_moment1: wgpu::Buffer,
-    /// Second moments of the coefficients, in f32 only.
-    pub sh_moment2: Option<wgpu::Buffer>,
+    /// Moments of the coefficients: first ones in half the size of the coefficients, or first and second ones
+    /// in twice that size in f32.
+    pub sh_moments: wgpu::Buffer,
     /// `[N]` vec4: sums of density control and, in z, the smoothing; see `project_backward.wgsl` and
     /// `smoothing.wgsl`.
     pub density_sums: wgpu::Buffer,
+    /// How the moments are stored.
+    pub kind: Moments,
     /// `[N*3]` vec4: sums over the bands of a view that is rendered in several, allocated on first use.
     band_gradients: OnceLock<wgpu::Buffer>,
 }
 
 impl BlockTraining {
-    /// How the moments are stored.
-    pub fn kind(&self) -> Moments {
-        if self.sh_moment2.is_some() { Moments::F32 } else { Moments::Compact }
-    }
-
     /// Its arrays whose content outlives an iteration, each with its bytes per Gaussian; `stride` as given by
     /// [`sh_stride`].
     pub fn arrays(&self, stride: u32) -> Vec<(&wgpu::Buffer, usize)> {
         let colour = 16 * stride as usize;
-        match &self.sh_moment2 {
-            None => vec![(&self.moments, 64), (&self.sh_moment1, colour / 2), (&self.density_sums, 16)],
-            Some(second) => {
-                vec![
-                    (&self.moments, 96),
-                    (&self.sh_moment1, colour),
-                    (second, colour),
-                    (&self.density_sums, 16),
-                ]
-            }
-        }
+        let (of_transform, of_colour) = match self.kind {
+            Moments::Compact => (64, colour / 2),
+            Moments::F32 => (96, 2 * colour),
+        };
+        vec![(&self.moments, of_transform), (&self.sh_moments, of_colour), (&self.density_sums, 16)]
     }
 
     /// The sums of bands; allocated at the first call.
@@ -226,8 +216,9 @@ impl Blocks {
     pub fn push_trainable(&mut self, gpu: &Gpu, model: &Gaussians, cap: u32, moments: Moments) -> Result<()> {
         let cap = cap.max(model.len() as u32);
         let mut first = 0;
-        for start in (0..cap).step_by(BLOCK_CAPACITY as usize) {
-            let capacity = (cap - start).min(BLOCK_CAPACITY);
+        let full = block_capacity(moments);
+        for start in (0..cap).step_by(full as usize) {
+            let capacity = (cap - start).min(full);
             let block = self.allocate(gpu, capacity, Some(moments))?;
             self.blocks.push(block);
             let at = self.blocks.len() - 1;
@@ -254,18 +245,11 @@ impl Blocks {
         let stride = sh_stride(self.sh_degree);
         let training = match training {
             None => None,
-            Some(Moments::Compact) => Some(BlockTraining {
-                moments: rows("moments", 4)?,
-                sh_moment1: halves("sh_moment1", stride)?,
-                sh_moment2: None,
+            Some(kind) => Some(BlockTraining {
+                moments: rows("moments", if kind == Moments::F32 { 6 } else { 4 })?,
+                sh_moments: halves("sh_moments", if kind == Moments::F32 { 4 * stride } else { stride })?,
                 density_sums: rows("density_sums", 1)?,
-                band_gradients: OnceLock::new(),
-            }),
-            Some(Moments::F32) => Some(BlockTraining {
-                moments: rows("moments", 6)?,
-                sh_moment1: rows("sh_moment1", stride)?,
-                sh_moment2: Some(rows("sh_moment2", stride)?),
-                density_sums: rows("density_sums", 1)?,
+                kind,
                 band_gradients: OnceLock::new(),
             }),
         };

@@ -26,6 +26,56 @@ pub struct GpuOptions {
     pub shader_checks: Option<bool>,
 }
 
+/// Storage buffers of one kernel, at most. WebGPU guarantees 8, so this is asked for by name. Workgroup
+/// memory and threads stay within what WebGPU guarantees. `tests/shaders` compares all of it with every
+/// kernel.
+pub const STORAGE_BUFFERS: u32 = 10;
+
+/// The limits to open the adapter `name` with: what kernels need, and sizes of buffers and dispatches as
+/// large as the adapter has them.
+///
+/// # Errors
+/// [`CoreError::NoAdapter`] if the adapter lacks something.
+fn limits_for_kernels(adapter: wgpu::Limits, name: &str) -> Result<wgpu::Limits> {
+    let guaranteed = wgpu::Limits::default();
+    let limits = wgpu::Limits {
+        max_storage_buffers_per_shader_stage: STORAGE_BUFFERS,
+        max_compute_workgroup_storage_size: guaranteed.max_compute_workgroup_storage_size,
+        max_compute_invocations_per_workgroup: guaranteed.max_compute_invocations_per_workgroup,
+        max_compute_workgroup_size_x: guaranteed.max_compute_workgroup_size_x,
+        ..adapter.clone()
+    };
+    let needs = [
+        (
+            "storage buffers in a shader",
+            limits.max_storage_buffers_per_shader_stage,
+            adapter.max_storage_buffers_per_shader_stage,
+        ),
+        (
+            "bytes of workgroup memory",
+            limits.max_compute_workgroup_storage_size,
+            adapter.max_compute_workgroup_storage_size,
+        ),
+        (
+            "threads in a workgroup",
+            limits.max_compute_invocations_per_workgroup.max(limits.max_compute_workgroup_size_x),
+            adapter.max_compute_invocations_per_workgroup.min(adapter.max_compute_workgroup_size_x),
+        ),
+    ];
+    match needs.into_iter().find(|(_, needed, has)| has < needed) {
+        Some((what, needed, has)) => Err(CoreError::NoAdapter(format!(
+            "{name} allows {has} {what}, and training needs {needed}; update its driver, or use another GPU"
+        ))),
+        None => Ok(limits),
+    }
+}
+
+/// Largest buffer that a kernel may bind, bytes. Shaders compute addresses in 32 bits, so a larger one would
+/// be read and written at wrapped addresses without an error, whatever the adapter allows.
+fn largest_binding(limits: &wgpu::Limits) -> u64 {
+    limits.max_storage_buffer_binding_size.min(limits.max_buffer_size).min(u32::MAX.into())
+}
+
 /// A smaller limit leaves no room for any work; it was probably not meant as bytes.
 const LEAST_MEMORY_LIMIT: u64 = 1 << 20;
 
@@ -196,7 +246,7 @@ impl Gpu {
         let descriptor = wgpu::DeviceDescriptor {
             label: Some("fathom"),
             required_features: features,
-            required_limits: adapter.limits(),
+            required_limits: limits_for_kernels(adapter.limits(), &summary.name)?,
             ..Default::default()
         };
         let (device, queue) = pollster::block_on(adapter.request_device(&descriptor))
@@ -260,6 +310,11 @@ impl Gpu {
         &self.kernels
     }
 
+    /// Largest buffer that a kernel may bind, bytes.
+    pub fn largest_binding(&self) -> u64 {
+        largest_binding(&self.device.limits())
+    }
+
     /// [`GpuOptions::shader_checks`], resolved.
     pub fn shader_checks(&self) -> bool {
         self.shader_checks
@@ -305,8 +360,7 @@ impl Gpu {
     /// # Errors
     /// As [`Gpu::buffer`].
     pub(crate) fn streamed(&self, label: &'static str, bytes: u64) -> Result<wgpu::Buffer> {
-        let limits = self.device.limits();
-        let limit_bytes = limits.max_storage_buffer_binding_size.min(limits.max_buffer_size);
+        let limit_bytes = self.largest_binding();
         if bytes > limit_bytes {
             return Err(CoreError::BufferTooLarge { buffer: label, needed_bytes: bytes, limit_bytes });
         }
@@ -438,4 +492,45 @@ fn choose(mut adapters: Vec<wgpu::Adapter>, options: GpuOptions) -> Result<wgpu:
         )));
     }
     Ok(first)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn no_binding_is_larger_than_addresses_of_32_bits_reach() {
+        let of = |binding, buffer| {
+            largest_binding(&wgpu::Limits {
+                max_storage_buffer_binding_size: binding,
+                max_buffer_size: buffer,
+                ..Default::default()
+            })
+        };
+        assert_eq!(of(128 << 20, 1 << 31), 128 << 20);
+        assert_eq!(of(1 << 40, 1 << 40), u64::from(u32::MAX), "a word beyond it would be word 0");
+        assert_eq!(of(1 << 40, 1 << 30), 1 << 30);
+    }
+
+    #[test]
+    fn adapters_that_lack_what_kernels_need_are_refused_by_name() {
+        let least =
+            wgpu::Limits { max_storage_buffers_per_shader_stage: STORAGE_BUFFERS, ..Default::default() };
+        assert_eq!(limits_for_kernels(least.clone(), "A").ok(), Some(least.clone()));
+        let more = wgpu::Limits {
+            max_compute_workgroup_storage_size: 65_536,
+            max_buffer_size: 1 << 40,
+            ..least.clone()
+        };
+        let opened = limits_for_kernels(more, "A").expect("more is no less");
+        assert_eq!((opened.max_compute_workgroup_storage_size, opened.max_buffer_size), (16_384, 1 << 40));
+        let refused =
+            |limits| limits_for_kernels(limits, "Old GPU").expect_err("it lacks something").to_string();
+        let few = wgpu::Limits::default();
+        assert!(refused(few).contains("Old GPU allows 8 storage buffers in a shader, and training needs 10"));
+        let little = wgpu::Limits { max_compute_workgroup_storage_size: 8192, ..least.clone() };
+        assert!(refused(little).contains("8192 bytes of workgroup memory"));
+        let narrow = wgpu::Limits { max_compute_workgroup_size_x: 128, ..least };
+        assert!(refused(narrow).contains("128 threads in a workgroup"));
+    }
 }

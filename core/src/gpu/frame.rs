@@ -35,8 +35,7 @@ pub struct ListLimits {
 impl ListLimits {
     /// The limits of the device's bindings.
     pub fn of(gpu: &Gpu) -> Self {
-        let limits = gpu.device().limits();
-        let rows = most_rows(limits.max_storage_buffer_binding_size.min(limits.max_buffer_size));
+        let rows = most_rows(gpu.largest_binding());
         Self { visible: rows, intersections: rows }
     }
 

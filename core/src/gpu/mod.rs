@@ -17,10 +17,11 @@ mod seams;
 mod sort;
 mod workload;
 
-pub use blocks::{BLOCK_CAPACITY, Block, BlockTraining, Blocks, sh_stride};
+pub use blocks::{BLOCK_CAPACITY, Block, BlockTraining, Blocks, block_capacity, sh_stride};
 pub use bounds::{CULL_CHUNK, spatial_order};
 pub use device::{
-    AdapterSummary, Gpu, GpuOptions, adapters, device_for_test, limited_device_for_test, numbered,
+    AdapterSummary, Gpu, GpuOptions, STORAGE_BUFFERS, adapters, device_for_test, limited_device_for_test,
+    numbered,
 };
 pub use frame::{Frame, FrameTargets, ListLimits, Overflow};
 pub use kernel::{

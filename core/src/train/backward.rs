@@ -38,7 +38,7 @@ pub fn record_backward(
         appearance.record_gradients(gpu, recorder, splats)?;
     }
     for (index, block, training) in blocks.trainable() {
-        let kernel = match training.kind() {
+        let kernel = match training.kind {
             Moments::Compact => "project_backward",
             Moments::F32 => "project_backward_f32",
         };
@@ -102,7 +102,7 @@ pub fn record_backward_in_bands(
         appearance.record_gradients(gpu, recorder, splats)?;
     }
     for (_, block, training) in blocks.trainable() {
-        let kernel = match training.kind() {
+        let kernel = match training.kind {
             Moments::Compact => "project_backward_bands",
             Moments::F32 => "project_backward_bands_f32",
         };
@@ -162,13 +162,10 @@ fn record_step(
         ("transforms", &block.transforms),
         ("sh_coeffs", &block.sh_coeffs),
         ("moments", &training.moments),
-        ("sh_moment1", &training.sh_moment1),
+        ("sh_moments", &training.sh_moments),
         ("density_sums", &training.density_sums),
         ("water", &frame.water),
     ];
     bound.extend_from_slice(sources);
-    if let Some(second) = &training.sh_moment2 {
-        bound.push(("sh_moment2", second));
-    }
     recorder.dispatch(kernel, groups, &bound)
 }

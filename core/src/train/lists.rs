@@ -101,7 +101,6 @@ pub(super) fn lists(
     };
     let (trained, frozen) = (u64::from(config.max_gaussians).max(focus.len() as u64), context.len() as u64);
     let pictures: Vec<[u32; 2]> = views.iter().map(|view| [view.camera.width, view.camera.height]).collect();
-    let limits = gpu.device().limits();
     let run = RunSize {
         settings: settings(config, medium),
         trained,
@@ -112,7 +111,7 @@ pub(super) fn lists(
         ),
         pictures: &pictures,
         tile: gpu.tile(),
-        binding_bytes: limits.max_storage_buffer_binding_size.min(limits.max_buffer_size),
+        binding_bytes: gpu.largest_binding(),
         measures: false,
     };
     run.lists()

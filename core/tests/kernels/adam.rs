@@ -91,8 +91,7 @@ fn compare_kind(
     // Rubbish that no Gaussian may read before its first step.
     let (_, _, training) = view.blocks.trainable().next().unwrap();
     poison(&gpu, &training.moments);
-    poison(&gpu, &training.sh_moment1);
-    training.sh_moment2.iter().for_each(|second| poison(&gpu, second));
+    poison(&gpu, &training.sh_moments);
     let (twin, of_a_step) = match moments {
         Moments::F32 => (adam as Twin, 1e-3),
         // Logarithms in 16 bits: half a level is 0.14 % of a first moment and 0.07 % of the root of a second.

@@ -3,7 +3,7 @@
 
 use fathom_core::config::Moments;
 use fathom_core::gaussians::Gaussians;
-use fathom_core::gpu::{BLOCK_CAPACITY, Blocks, Frame, Overflow, Recorder, Renderer, counter, spatial_order};
+use fathom_core::gpu::{Blocks, Frame, Overflow, Recorder, Renderer, block_capacity, counter, spatial_order};
 use fathom_twins::samples;
 
 use crate::device::{assert_same_bits, layouts, poison};
@@ -155,7 +155,7 @@ fn an_empty_block_takes_nothing_from_the_block_before_it() {
         let whole = View::render(&gpu, &scene);
         // The cap needs a second block, which has no Gaussian yet.
         let mut blocks = Blocks::new(&gpu, 0).unwrap();
-        blocks.push_trainable(&gpu, &scene.model, BLOCK_CAPACITY + 64, Moments::F32).unwrap();
+        blocks.push_trainable(&gpu, &scene.model, block_capacity(Moments::F32) + 64, Moments::F32).unwrap();
         assert_eq!(blocks.iter().len(), 2);
         let mut roomy = View::prepare(&gpu, &scene, blocks);
         // Lists are sized by the cap, as in a trainer, not by the count; entries beyond the count are

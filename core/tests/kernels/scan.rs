@@ -55,6 +55,60 @@ fn a_scan_of_any_length_is_the_running_sum() {
     }
 }
 
+/// A sum that wraps looks small again, so lists that are much too short would be taken for long enough.
+#[test]
+fn totals_beyond_31_and_32_bits_never_look_small() {
+    for gpu in layouts() {
+        // The most that one Gaussian can have: each of 32,768 tiles.
+        const TILES: u32 = 32_768;
+        for (n, total) in [
+            (65_535, 65_535 * u64::from(TILES)),
+            (65_536, 1 << 31),
+            (65_537, (1 << 31) + u64::from(TILES)),
+            (131_071, (1 << 32) - u64::from(TILES)),
+            (131_072, 1 << 32),
+            (131_073, (1 << 32) + u64::from(TILES)),
+            (300_000, 300_000 * u64::from(TILES)),
+        ] {
+            let (_, sum) = scan(&gpu, &vec![TILES; n]);
+            assert_eq!(u64::from(sum), total.min(u32::MAX.into()), "{n} Gaussians in every tile");
+        }
+    }
+}
+
+#[test]
+fn intersections_beyond_31_bits_are_an_overflow_and_no_work() {
+    let Some(gpu) = device() else { return };
+    for needed in [1000, 1001, 1 << 31, (1 << 31) + 1, u32::MAX - 1, u32::MAX] {
+        let view =
+            FrameUniform { intersect_capacity: 1000, gaussians: 1, blocks: 1, ..FrameUniform::default() };
+        let frame = gpu.uniform("frame", &view);
+        let sums = storage(&gpu, &[0, needed]);
+        let mut counts = [0_u32; counter::COUNT as usize];
+        counts[counter::VISIBLE as usize] = 1;
+        let counters = storage(&gpu, &counts);
+        let args = gpu.buffer("args", 3 * 4 * 16).unwrap();
+        poison(&gpu, &args);
+        let mut recorder = Recorder::new(&gpu);
+        let buffers = [("frame", &frame), ("sums", &sums), ("counters", &counters), ("args", &args)];
+        recorder.dispatch("count_intersections", Size::Groups(1), &buffers).unwrap();
+        recorder.submit();
+        let counts: Vec<u32> = gpu.read(&counters, 0, counter::COUNT as usize).unwrap();
+        let at = |slot: u32| counts[slot as usize];
+        let args: Vec<[u32; 3]> = gpu.read(&args, 0, 16).unwrap();
+        let groups = |slot: u32| args[slot as usize].iter().map(|&n| u64::from(n)).product::<u64>();
+        let slots = [counter::ARGS_INTERSECT, counter::ARGS_TILE_SORT, counter::ARGS_TILE_SCAN];
+        if needed <= 1000 {
+            assert_eq!((at(counter::INTERSECTIONS), at(counter::OVERFLOW)), (needed, 0));
+            assert!(slots.map(groups).iter().all(|&groups| groups > 0));
+        } else {
+            assert_eq!((at(counter::INTERSECTIONS), at(counter::OVERFLOW)), (0, 2), "{needed} are needed");
+            assert_eq!(at(counter::NEEDED_INTERSECTIONS), needed);
+            assert_eq!(slots.map(groups), [0; 3], "{needed} are needed, and kernels still run");
+        }
+    }
+}
+
 /// Arguments (groups in x, y, z) that `count_visible` writes to `slot` for a total.
 fn arguments(gpu: &Gpu, visible: u32, slot: u32) -> [u32; 3] {
     // With one Gaussian, the scan has one chunk, so the total is in sums[1].

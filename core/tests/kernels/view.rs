@@ -321,7 +321,9 @@ impl View {
         for (_, block, training) in self.blocks.trainable() {
             let n = block.count as usize;
             let moments: Vec<[f32; 24]> = self.gpu.read(&training.moments, 0, n).unwrap();
-            let sh: Vec<f32> = self.gpu.read(&training.sh_moment1, 0, stride * n).unwrap();
+            // First and second moments, vec4 by vec4; gradients are where first moments would be.
+            let pairs: Vec<[[f32; 4]; 2]> = self.gpu.read(&training.sh_moments, 0, stride * n / 4).unwrap();
+            let sh: Vec<f32> = pairs.into_iter().flat_map(|[first, _]| first).collect();
             for (row, m) in moments.iter().map(|m| m.map(f64::from)).enumerate() {
                 v.means[index] = [m[0], m[1], m[2]];
                 v.opacity_logits[index] = m[3];

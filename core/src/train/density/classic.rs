@@ -120,7 +120,7 @@ impl Trainer {
         for (_, block, training) in self.blocks.trainable() {
             // Words per row of moments, and the words of the opacity: first and second moment share one word
             // or have one each.
-            let words = match training.kind() {
+            let words = match training.kind {
                 Moments::Compact => [16_u32, 3, 3, 0],
                 Moments::F32 => [24, 3, 15, 0],
             };

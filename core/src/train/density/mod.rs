@@ -12,7 +12,7 @@ use bytemuck::{Pod, Zeroable};
 
 use super::Trainer;
 use crate::config::Strategy;
-use crate::gpu::{BLOCK_CAPACITY, Block, BlockTraining, Recorder, Size, sh_stride};
+use crate::gpu::{Block, BlockTraining, Recorder, Size, block_capacity, sh_stride};
 use crate::{CoreError, Result};
 
 /// Largest number of Gaussians split or moved between two submissions: bounds the staging buffer.
@@ -125,7 +125,7 @@ impl Trainer {
         mut act: impl FnMut(&Block, &BlockTraining, &[[u32; 2]]) -> Result<()>,
     ) -> Result<()> {
         for (index, block, training) in self.blocks.trainable() {
-            let first = index as u32 * BLOCK_CAPACITY;
+            let first = index as u32 * block_capacity(training.kind);
             let rows: Vec<[u32; 2]> = indices
                 .iter()
                 .enumerate()
