@@ -141,8 +141,8 @@ async fn a_revoked_token_ends_a_download_however_slowly_it_is_read() {
         // Data in flight may still arrive: the windows of HTTP/2.
         assert!(bytes < 12 * PIECE, "{bytes} bytes arrived after the token was revoked");
         let end = end.expect("it ended as if it were complete");
-        // A stream that is not read cannot be answered; only the end of its connection frees it. An answer now
-        // would mean that it waited for its client until here.
+        // A stream that is not read cannot be answered; only the end of its connection frees it. An answer
+        // now would mean that it waited for its client until here.
         assert_eq!(reason(&end), None, "the connection was still open: {end:?}");
     }
 }
