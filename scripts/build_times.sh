@@ -52,8 +52,10 @@ for file in weights.rs init.rs; do
         for commit in "${commits[@]}"; do
             tree=$folder/$commit/tree
             if [[ $file == weights.rs ]]; then
-                path=$(cd "$tree" && ls coordinator/plan/src/weights.rs coordinator/src/partition/weights.rs 2>/dev/null | head -n 1)
-                change "$tree/$path" "let deepest =" "$round"
+                # Up to 0ca6e4b the plan was a module of the coordinator.
+                path=$tree/coordinator/plan/src/weights.rs
+                [ -e "$path" ] || path=$tree/coordinator/src/partition/weights.rs
+                change "$path" "let deepest =" "$round"
                 build "$commit" "a line of the plan"
             else
                 change "$tree/core/src/train/init.rs" "let far =" "$round"

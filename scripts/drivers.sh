@@ -51,7 +51,10 @@ fetch() {
     mkdir -p "$folder/package"
     say "fetching chromium-common (31 MB) for SwiftShader and the validation layer"
     (cd "$folder/package" && apt-get download -qq chromium-common >/dev/null 2>&1) || return 1
-    dpkg-deb -x "$folder"/package/chromium-common_*.deb "$folder" || return 1
+    # Moved into place when it is whole: what is there is taken for complete.
+    dpkg-deb -x "$folder"/package/chromium-common_*.deb "$folder/package/unpacked" || return 1
+    rm -rf "$folder/usr"
+    mv "$folder/package/unpacked/usr" "$folder/usr"
     rm -rf "$folder/package"
     chromium=$folder/usr/lib/chromium
     [ -e "$chromium/libvk_swiftshader.so" ]
@@ -124,7 +127,6 @@ trained() {
     digest "$into"
 }
 digest() { sha256sum "$1/model.ply" | cut -c 1-16; }
-psnr() { sed -nE 's/^ *"psnr": ([0-9.]+),?$/\1/p' "$1/metrics.json" | tail -n 1; }
 
 train() {
     local driver=$1 into=$out/train-$1 base=$out/train-lavapipe-256 one two resumed begin seconds
@@ -141,7 +143,7 @@ train() {
     elif ! awk -v a="$here" -v b="$there" 'BEGIN { d = a - b; exit !(d < 0.5 && d > -0.5) }'; then
         fail "$driver" train "$here dB, $there dB on lavapipe-256"
     else
-        row "$driver" train ok "$here dB, model $one three times, $seconds s"
+        row "$driver" train ok "$(printf '%.2f' "$here") dB, model $one three times, $seconds s"
     fi
 }
 psnr_of() { grep -oE '"psnr": ?[0-9.]+' | head -n 1 | grep -oE '[0-9.]+'; }

@@ -58,5 +58,5 @@ if [ "${#packages[@]}" -gt 0 ]; then
 fi
 
 if [ ! -e "${CARGO_TARGET_DIR:-target}/debug" ]; then
-    say "the first build compiles all dependencies: about 6 minutes on 2 cores"
+    say "the first build compiles all dependencies: about 7 minutes on 2 cores"
 fi

@@ -172,7 +172,10 @@ pub async fn upload_dataset(
     }
     let begun = client.begin_upload(request).await?;
     let Some(dataset) = begun.dataset else {
-        return Err(CliError::Message("the coordinator accepted the upload and named no dataset".to_owned()));
+        return Err(CliError::Message(
+            "the coordinator accepted the upload and named no dataset; use the same version on both sides"
+                .to_owned(),
+        ));
     };
     if begun.missing_count > 0 {
         upload(client, files).await?;

@@ -100,7 +100,7 @@ pub async fn run(args: DatasetArgs) -> Result<()> {
                 Some(root) if args.files => Some(client.read(root).await?),
                 None if args.files => {
                     let message = format!(
-                        "dataset {} is not committed, so it has no list of files",
+                        "dataset {} is not committed, so it has no list of files; run its `fathom dataset upload` again to finish it",
                         dataset.dataset_id
                     );
                     return Err(CliError::Message(message));

@@ -55,7 +55,7 @@ impl ArtifactIndex {
 
 fn unreadable(artifact: Artifact, blob: &BlobRef, error: &dyn std::error::Error) -> OwnTaskError {
     OwnTaskError::failed(format!(
-        "the {} {} cannot be read: {error}; use workers of the coordinator's version",
+        "the {} {} cannot be read: {error}; use one version of Fathom for the whole job",
         artifact.title(),
         blob.digest
     ))

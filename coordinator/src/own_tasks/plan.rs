@@ -266,16 +266,20 @@ mod tests {
 
     use super::*;
 
+    /// Views with the place and the direction that `look` gives to each.
+    fn views(count: u32, look: impl Fn(u32) -> (DVec3, DVec3)) -> Vec<TrainView> {
+        let camera = PinholeCamera { width: 64, height: 48, fx: 50.0, fy: 50.0, cx: 32.0, cy: 24.0 };
+        let view = |i| {
+            let (eye, direction) = look(i);
+            let pose = Pose::looking_at(eye, eye + direction, DVec3::Y);
+            TrainView { name: format!("{i:02}"), camera, pose, clear_range: 0.0 }
+        };
+        (0..count).map(view).collect()
+    }
+
     #[test]
     fn a_task_gets_the_clear_ranges_of_its_own_views() {
-        let camera = PinholeCamera { width: 64, height: 48, fx: 50.0, fy: 50.0, cx: 32.0, cy: 24.0 };
-        let views: Vec<TrainView> = (0..20)
-            .map(|i| {
-                let eye = DVec3::new(f64::from(i), 0.0, 0.0);
-                let pose = Pose::looking_at(eye, eye + DVec3::Z, DVec3::Y);
-                TrainView { name: format!("{i:02}"), camera, pose, clear_range: 0.0 }
-            })
-            .collect();
+        let views = views(20, |i| (DVec3::new(f64::from(i), 0.0, 0.0), DVec3::Z));
         let config = JobConfig::default();
         let input = PlanInput { views: &views, points: &Points::default(), config: &config };
         let mut plan = plan_for(&input, Connected::default()).unwrap();
@@ -289,14 +293,7 @@ mod tests {
 
     #[test]
     fn a_plan_without_workers_names_what_it_assumes() {
-        let camera = PinholeCamera { width: 64, height: 48, fx: 50.0, fy: 50.0, cx: 32.0, cy: 24.0 };
-        let views: Vec<TrainView> = (0..40)
-            .map(|i| {
-                let eye = DVec3::new(f64::from(i), 0.0, 0.0);
-                let pose = Pose::looking_at(eye, eye + DVec3::Z, DVec3::Y);
-                TrainView { name: format!("{i:02}"), camera, pose, clear_range: 0.0 }
-            })
-            .collect();
+        let views = views(40, |i| (DVec3::new(f64::from(i), 0.0, 0.0), DVec3::Z));
         let warned = |connected: Connected, change: fn(&mut PartitionConfig)| {
             let mut config = JobConfig::default();
             config.partition.auto = true;
@@ -323,15 +320,11 @@ mod tests {
 
     #[test]
     fn a_worker_gets_the_box_in_the_turned_axes_of_the_plan() {
-        let camera = PinholeCamera { width: 64, height: 48, fx: 50.0, fy: 50.0, cx: 32.0, cy: 24.0 };
         let turn = DQuat::from_rotation_y(0.5);
-        let views: Vec<TrainView> = (0..90)
-            .map(|i| {
-                let eye = turn * DVec3::new(f64::from(i % 30), 0.0, f64::from(i / 30) * 2.0);
-                let pose = Pose::looking_at(eye, eye + turn * DVec3::new(0.1, 0.4, 1.0), DVec3::Y);
-                TrainView { name: format!("{i:02}"), camera, pose, clear_range: 0.0 }
-            })
-            .collect();
+        let views = views(90, |i| {
+            let eye = turn * DVec3::new(f64::from(i % 30), 0.0, f64::from(i / 30) * 2.0);
+            (eye, turn * DVec3::new(0.1, 0.4, 1.0))
+        });
         let mut config = JobConfig::default();
         (config.partition.columns, config.partition.rows) = (3, 1);
         let input = PlanInput { views: &views, points: &Points::default(), config: &config };
