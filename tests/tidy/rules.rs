@@ -3,7 +3,7 @@
 //! Each check is a test. A failure names file and line, and says what to do. The checks themselves are tested
 //! on small strings below.
 //!
-//! Only the standard library is used: `rustc --edition 2024 --test tests/tidy/rules.rs` compiles it in a
+//! Only the standard library is used: `rustc --edition 2024 --test tests/tidy/main.rs` compiles it in a
 //! second.
 
 use std::collections::{BTreeMap, BTreeSet};
