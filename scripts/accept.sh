@@ -681,6 +681,17 @@ twelve_million() {
     fi
 }
 
+# Every driver that a CPU runs: a row for each driver and part.
+drivers() { # parts of scripts/drivers.sh, default all but memory
+    local driver part result text
+    scripts/drivers.sh "$@" >"$out/drivers.txt" 2>"$out/drivers.log" || miss "a driver fails, see $out/drivers.txt"
+    while read -r driver part result text; do
+        [ "$driver" = driver ] || row "$driver/$part" "scripts/drivers.sh $part $driver" "$result: $text"
+    done <"$out/drivers.txt"
+}
+# Peak memory at 1 M Gaussians, photographs of a megapixel included, beside the forecast.
+memory_1m() { drivers memory; }
+
 demo() {
     FATHOM_DEMO_STRICT=1 FATHOM_DEMO_OUT="$out/demo" scripts/demo.sh >"$out/demo.log" || miss "the demo failed, see $out/demo.log"
     row synth "make demo" "$(grep -E '^(metrics|time):' "$out/demo.log" | sed -E 's/^[a-z]+: *//' | paste -sd ';')" \
@@ -690,7 +701,7 @@ demo() {
 
 all='plans plan_scale merge_scale partitions readers demo fox other_programs speed step quality_for_time reef_360 fox_moments reef wreck water water_long sparse_waters other_waters viewer_colours reef_water
 open_water fox_long wreck_full
-twelve_million'
+twelve_million drivers memory_1m'
 for figure in ${1:-$all}; do
     "$figure"
 done

@@ -138,7 +138,7 @@ peers() {
     need_python
     have fox || exit 2
     train fox "$scenes/fox" --max-resolution 400 --max-gaussians 13500 --initial-points 10000 --iterations 600 \
-        --evaluate-every 100 --resolution-at '[0,0]' --sh-degree-at '[0,0,0]' --far-field 0 >"$bench/peers.json"
+        --evaluate-every 100 --resolution-at '[0,0]' --sh-degree-at '[0,0,0]' --background-gaussians 0 >"$bench/peers.json"
     python3 scripts/bench_report.py peers "$bench/peers.json"
     say "as JSON: $bench/peers.json"
 }

@@ -2,19 +2,22 @@
 # Runs the trainer on every Vulkan driver that a CPU can run, and compares them.
 #
 #     scripts/drivers.sh                     all of the below, as a table; about 25 minutes on 2 cores
-#     scripts/drivers.sh kernels|first|train|validation [DRIVER ...]
+#     scripts/drivers.sh kernels|first|train|validation|memory [DRIVER ...]
 #     scripts/drivers.sh fetch               only fetches SwiftShader and the validation layer
 #
 # Drivers: lavapipe-128, lavapipe-256, lavapipe-512 (Mesa with vectors of so many bits, which are subgroups of
 # 4, 8 and 16 lanes) and swiftshader (Google's driver: another compiler, another memory model, subgroups of
 # 4).
 #
-# kernels the tests of `core/tests/kernels`: each kernel against its twin first picture and gradients of one
-# iteration, compared with lavapipe-256 (core/examples/first_iteration.rs) train a short training twice, and
-# once stopped and resumed: the same bytes on one driver, and a PSNR within
-#             0.5 dB of that on lavapipe-256
-# validation  a short training under the Khronos validation layer: core and synchronisation on all drivers,
-#             GPU-assisted on lavapipe-256. It fails on every message that is not in ALLOWED
+#     kernels     the tests of `core/tests/kernels`: each kernel against its twin
+#     first       picture and gradients of one iteration, compared with lavapipe-256
+#                 (core/examples/first_iteration.rs)
+#     train       a short training twice, and once stopped and resumed: the same bytes on one driver, and a
+#                 PSNR within 0.5 dB of that on lavapipe-256
+#     validation  a short training under the Khronos validation layer: core and synchronisation on all
+#                 drivers, GPU-assisted on lavapipe-256. It fails on every message that is not in ALLOWED
+#     memory      (only when named; 15 minutes) peak memory of a training of 1 M Gaussians from photographs of
+#                 1 megapixel: the forecast must be within 10 % of it
 #
 # SwiftShader and a current validation layer come from Debian's package chromium-common, which is unpacked,
 # not installed, into `drivers` below the target folder.
@@ -88,7 +91,7 @@ fail() {
 }
 
 build() {
-    cargo build --workspace --bin fathom --example first_iteration
+    cargo build --workspace --bin fathom --example first_iteration --example train_scene
     kernels=$(cargo test --workspace --test kernels --no-run --message-format=json \
         | sed -nE 's/.*"name":"kernels".*"executable":"([^"]+)".*/\1/p' | tail -n 1)
     [ -x "$kernels" ] || { say "the tests of the kernels do not build"; exit 1; }
@@ -220,12 +223,33 @@ validation() {
     fi
 }
 
+# 24 photographs of 1184x888 and 1.3 million points, of which a run takes 1 million.
+memory() {
+    local driver=$1 scene=$folder/out/large result=$out/memory-$1.json peak forecast
+    if [ ! -e "$scene/truth/water.json" ]; then
+        rm -rf "$scene"
+        "$fathom" synth "$scene" --water off --views 24 --size 1184x888 --points-per-view 60000 >/dev/null 2>&1
+    fi
+    if ! on "$driver" "$target/debug/examples/train_scene" "$scene" --iterations 24 --max-gaussians 1000000 \
+        --resolution-at '[0,0]' --sh-degree-at '[0,0,0]' >"$result" 2>"$result.log"; then
+        fail "$driver" memory "it fails; see $result.log"
+        return
+    fi
+    peak=$(sed -nE 's/^  "device_peak_bytes": ([0-9]+),$/\1/p' "$result")
+    forecast=$(sed -nE 's/^  "forecast_bytes": ([0-9]+),$/\1/p' "$result")
+    if awk -v f="$forecast" -v p="$peak" 'BEGIN { exit !(f < 1.1 * p && f > 0.9 * p) }'; then
+        row "$driver" memory ok "$((peak / 1000000)) bytes a Gaussian, forecast $((forecast / 1000000))"
+    else
+        fail "$driver" memory "peak $peak bytes, forecast $forecast"
+    fi
+}
+
 parts=(kernels first train validation)
 case "${1:-all}" in
     all) shift "$#" ;;
     fetch) fetch || { say "SwiftShader is not at hand: chromium-common is neither installed nor can be fetched"; exit 1; }; exit 0 ;;
-    kernels | first | train | validation) parts=("$1"); shift ;;
-    *) sed -n '2,19p' "$0"; exit 2 ;;
+    kernels | first | train | validation | memory) parts=("$1"); shift ;;
+    *) sed -n '2,22p' "$0"; exit 2 ;;
 esac
 drivers=("${@:-${ALL[@]}}")
 [ "$#" -gt 0 ] || drivers=("${ALL[@]}")

@@ -5,16 +5,18 @@
                               [--current TEXT] [KEY=VALUE ...]
     scripts/history.py list [FIGURE]
     scripts/history.py plot FIGURE [--scene S] [--variant V] [--value psnr] [-o FILE.svg]
+    scripts/history.py merge RESULTS
     scripts/history.py check
 
 `append` adds a row with today's date and the commit of the working tree. A VALUE is a number or a JSON list;
 None, NaN and infinite values are omitted.
 With --current it also replaces the result and the date of that row in BENCHMARKS.md: the one between the
 lines of MARKERS whose first two cells are the figure and "scene variant". It never adds a row there.
-`list` prints all figures, scenes and values. `plot` draws one value over time as SVG, a line for each
+`merge` adds the rows of a folder that the GPU kit wrote (scripts/gpu.sh), each once, and renews the table of
+bench/gpu.md. `list` prints all figures, scenes and values. `plot` draws one value over time as SVG, a line for each
 scene, variant and settings. `check` reads every row, and tries all of this on made-up rows.
 
-FATHOM_HISTORY and FATHOM_BENCHMARKS name other files, for a dry run.
+FATHOM_HISTORY, FATHOM_BENCHMARKS and FATHOM_BENCHMARKS_GPU name other files, for a dry run.
 
 Keys of a row: date, commit, recorded_in (the commit that wrote an old row), figure, scene, variant, command,
 adapter, settings, values, note. The figure is a function of scripts/accept.sh where there is one.
@@ -33,6 +35,7 @@ from xml.sax.saxutils import escape
 
 ROOT = Path(__file__).resolve().parent.parent
 MARKERS = "<!-- accept: begin -->", "<!-- accept: end -->"
+GPU_MARKERS = "<!-- begin -->", "<!-- end -->"
 KEYS = ("date", "commit", "recorded_in", "figure", "scene", "variant", "command", "adapter", "settings", "values", "note")
 # Options of `fathom train` and `train_scene` that affect a result.
 OPTIONS = ("partitions", "workers", "preset", "max-resolution", "iterations", "max-gaussians", "seed")
@@ -46,6 +49,10 @@ def history_path():
 
 def benchmarks_path():
     return Path(os.environ.get("FATHOM_BENCHMARKS", ROOT / "BENCHMARKS.md"))
+
+
+def gpu_path():
+    return Path(os.environ.get("FATHOM_BENCHMARKS_GPU", ROOT / "bench/gpu.md"))
 
 
 def commit():
@@ -86,6 +93,12 @@ def append(figure, command, values=None, **more):
     if unknown := set(row) - set(KEYS):
         raise ValueError(f"there is no key {', '.join(sorted(unknown))}; keys are {', '.join(KEYS)}")
     row = {key: row[key] for key in KEYS if row.get(key) not in (None, "", {})}
+    write_rows([row])
+    return row
+
+
+def write_rows(rows):
+    """Adds whole rows at the end of the history."""
     path = history_path()
     path.parent.mkdir(parents=True, exist_ok=True)
     with open(path, "a+b") as file:
@@ -94,13 +107,13 @@ def append(figure, command, values=None, **more):
             file.seek(-1, os.SEEK_END)
             if file.read(1) != b"\n":
                 file.write(b"\n")
-        file.write(json.dumps(row, ensure_ascii=False, allow_nan=False).encode() + b"\n")
-    return row
+        for row in rows:
+            file.write(json.dumps(row, ensure_ascii=False, allow_nan=False).encode() + b"\n")
 
 
-def read():
+def read(path=None):
     """All rows, oldest first; an invalid line ends the program with its number."""
-    path, rows = history_path(), []
+    path, rows = path or history_path(), []
     for number, line in enumerate(path.read_text(encoding="utf-8").splitlines() if path.is_file() else [], 1):
         try:
             row = json.loads(line)
@@ -125,9 +138,9 @@ def between(text, begin, end):
     return text.index(begin) + len(begin), text.index(end)
 
 
-def replace_between(begin, end, new):
-    """Replaces the text between two marker lines of BENCHMARKS.md."""
-    path = benchmarks_path()
+def replace_between(begin, end, new, path=None):
+    """Replaces the text between two marker lines of BENCHMARKS.md or another file."""
+    path = path or benchmarks_path()
     text = path.read_text(encoding="utf-8")
     place = between(text, begin, end)
     if place is None:
@@ -156,6 +169,38 @@ def set_current(figure, scene, measured, date):
     if found:
         replace_between(*MARKERS, "\n".join(lines))
     return found
+
+
+def merge(folder):
+    """Adds the rows of a run of the GPU kit and renews the table of GPUs; returns how many rows were new."""
+    path = Path(folder) / "rows.jsonl"
+    if not path.is_file():
+        sys.exit(f"history: {path} is not there; name the folder of results that the kit wrote")
+    have = {json.dumps(row, sort_keys=True) for row in read()}
+    new = [row for row in read(path) if json.dumps(row, sort_keys=True) not in have]
+    write_rows(new)
+    if table := gpu_table(read()):
+        replace_between(*GPU_MARKERS, table, gpu_path())
+    return len(new)
+
+
+def gpu_table(rows):
+    """The newest result of each run on each card: whole trainings, and sums beside gsplat."""
+    newest = {}
+    for row in rows:
+        shown = row["figure"] in ("gpu_scene", "gpu_mcmc") or row["figure"] == "gpu_gsplat" and "sum" in row.get("variant", "")
+        if shown and row.get("values"):
+            newest[row.get("adapter", ""), row["figure"], row.get("scene", ""), row.get("variant", "")] = row
+    if not newest:
+        return ""
+    names = {"psnr": "{:.2f} dB", "j_psnr": "J {:.2f} dB", "wall_s": "{:.1f} s", "ms_per_step": "{:.2f} ms a step",
+             "gaussians": "{:,.0f} Gaussians", "fathom_ms": "{:.2f} ms", "gsplat_ms": "gsplat {:.2f} ms", "ratio": "ratio {:.2f}"}
+    lines = ["| card | run | measured | date |", "|---|---|---|---|"]
+    for (adapter, figure, scene, variant), row in sorted(newest.items()):
+        measured = ", ".join(text.format(row["values"][key]) for key, text in names.items() if key in row["values"])
+        run = " ".join(word for word in (f"`{figure}`", scene, variant) if word)
+        lines.append(f"| {adapter.split(' (')[0]} | {run} | {measured[:LONGEST_CELL]} | {row['date']} |")
+    return "\n".join(lines)
 
 
 def value_of(text):
@@ -271,6 +316,14 @@ def check():
             raise AssertionError("a result of any length is accepted")
         except ValueError:
             pass
+        os.environ["FATHOM_BENCHMARKS_GPU"] = f"{folder}/gpu.md"
+        gpu_path().write_text(f"a\n{GPU_MARKERS[0]}\nnone\n{GPU_MARKERS[1]}\nb\n")
+        row = {"date": "2026-01-03", "commit": "c", "figure": "gpu_scene", "scene": "fox", "command": "train_scene fox",
+               "adapter": "Card (1.2)", "values": {"psnr": 33.456, "wall_s": 60}}
+        (Path(folder) / "rows.jsonl").write_text(json.dumps(row) + "\n")
+        assert (merge(folder), merge(folder)) == (1, 0), "a row was lost or added twice"
+        assert read()[-1] == row
+        assert "| Card | `gpu_scene` fox | 33.46 dB, 60.0 s | 2026-01-03 |\n" in gpu_path().read_text()
         picture = Path(folder) / "plot.svg"
         plot("fox", None, None, "psnr", picture)
         assert picture.read_text().count("<polyline") == 3 and picture.read_text().endswith("</svg>\n")
@@ -294,6 +347,8 @@ def main():
     verb.add_argument("--variant")
     verb.add_argument("--value", default="psnr")
     verb.add_argument("-o", "--output", type=Path)
+    verb = verbs.add_parser("merge")
+    verb.add_argument("results", type=Path)
     verbs.add_parser("check")
     said = parser.parse_args()
     if said.verb == "append":
@@ -302,6 +357,8 @@ def main():
         place = " ".join(word for word in (said.scene, said.variant) if word)
         if said.current and not set_current(said.figure, place, said.current, row["date"]):
             print(f"history: {said.figure}, {place}: only in the history; BENCHMARKS.md has no such row", file=sys.stderr)
+    elif said.verb == "merge":
+        print(f"history: {merge(said.results)} new rows")
     elif said.verb == "list":
         listing(said.figure)
     elif said.verb == "plot":

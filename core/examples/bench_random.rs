@@ -1,16 +1,16 @@
 //! Measures the kernels of a training step over random Gaussians, and the sort and the scan alone, for
 //! `make bench`.
 //!
-//! `cargo run --release --example bench_random -- [GAUSSIANS] [WIDTH HEIGHT] [--repeats N] [--entries N,N]`:
-//! the scene is that of `shared/random_scene.rs`. Without arguments it has 30,000 Gaussians at 480x270 on a
-//! CPU adapter, 1,000,000 at 1920x1080 on a GPU. A step is forward, backward with a constant gradient of the
-//! picture instead of a loss, and Adam. The learning rates are so small that every repetition has the same
-//! work.
+//! `cargo run --release --example bench_random -- [GAUSSIANS] [WIDTH HEIGHT] [--repeats N] [--entries N,N]
+//! [--write-scene FILE]`: the scene is that of `shared/random_scene.rs`. Without arguments it has 30,000
+//! Gaussians at 480x270 on a CPU adapter, 1,000,000 at 1920x1080 on a GPU. A step is forward, backward with a
+//! constant gradient of the picture instead of a loss, and Adam. The learning rates are so small that every
+//! repetition has the same work.
 //!
 //! It prints one JSON object. Times are medians over the repetitions in seconds. `seconds` are the device's
 //! timestamps; `cpu_seconds` are CPU time on a CPU adapter, where each stage runs alone. `passes` are whole
-//! submissions. Bytes are those of the lists that a stage reads and writes, each entry once; null if there is
-//! no simple count.
+//! submissions. `--write-scene` also writes the scene for other programs (`random_scene::write`). Bytes are
+//! those of the lists that a stage reads and writes, each entry once; null if there is no simple count.
 
 use std::error::Error;
 use std::sync::Arc;
@@ -48,6 +48,7 @@ struct Arguments {
     height: u32,
     repeats: u32,
     entries: Vec<u32>,
+    write_scene: Option<String>,
 }
 
 fn arguments(is_cpu: bool) -> Fallible<Arguments> {
@@ -58,6 +59,7 @@ fn arguments(is_cpu: bool) -> Fallible<Arguments> {
         height,
         repeats: if is_cpu { 5 } else { 20 },
         entries: vec![1_000_000, 4_000_000],
+        write_scene: None,
     };
     let mut words = std::env::args().skip(1);
     let mut numbers: Vec<u32> = Vec::new();
@@ -66,6 +68,7 @@ fn arguments(is_cpu: bool) -> Fallible<Arguments> {
         match word.as_str() {
             "--repeats" => found.repeats = value()?.parse()?,
             "--entries" => found.entries = value()?.split(',').map(str::parse).collect::<Result<_, _>>()?,
+            "--write-scene" => found.write_scene = Some(value()?),
             number => numbers
                 .push(number.parse().map_err(|_| format!("{number} is neither a number nor an option"))?),
         }
@@ -75,7 +78,9 @@ fn arguments(is_cpu: bool) -> Fallible<Arguments> {
         [n] => found.gaussians = n,
         [n, width, height] => (found.gaussians, found.width, found.height) = (n, width, height),
         _ => {
-            return Err("usage: bench_random [GAUSSIANS] [WIDTH HEIGHT] [--repeats N] [--entries N,N]".into());
+            return Err("usage: bench_random [GAUSSIANS] [WIDTH HEIGHT] [--repeats N] [--entries N,N] \
+                        [--write-scene FILE]"
+                .into());
         }
     }
     let numbers = [found.repeats, found.gaussians, found.width, found.height];
@@ -341,6 +346,11 @@ fn main() -> Fallible<()> {
     let gpu = Gpu::new(GpuOptions { allow_cpu: true, ..Default::default() })?;
     let is_cpu = gpu.adapter().is_cpu;
     let arguments = arguments(is_cpu)?;
+    if let Some(file) = &arguments.write_scene {
+        let Arguments { gaussians, width, height, .. } = arguments;
+        random_scene::write(file.as_ref(), gaussians, width, height)
+            .map_err(|error| format!("{file} cannot be written: {error}"))?;
+    }
     let step = Step::new(&gpu, &arguments)?;
     // Compiles the other kernels.
     step.run()?;

@@ -12,6 +12,7 @@
 //!
 //! If the scene has `truth/`, J is compared with it. At the end it prints one JSON object.
 
+use std::collections::BTreeSet;
 use std::error::Error;
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -133,6 +134,13 @@ fn evaluate(
     }
     let count = test.views.len() as f64;
     Ok((psnr_sum / count, ssim_sum / count))
+}
+
+/// The most memory that this process has had, with the device's on a CPU adapter; `None` except on Linux.
+fn process_peak_bytes() -> Option<u64> {
+    let status = std::fs::read_to_string("/proc/self/status").ok()?;
+    let kibibytes = status.lines().find_map(|line| line.strip_prefix("VmHWM:"))?.trim();
+    Some(1024 * kibibytes.split_whitespace().next()?.parse::<u64>().ok()?)
 }
 
 fn add(times: &mut Vec<KernelTime>, more: Vec<KernelTime>) {
@@ -336,6 +344,8 @@ fn main() -> Fallible<()> {
         .map(|view| clear_quality(&gpu, &model, view, &test, &folder))
         .transpose()?
         .flatten();
+    let pictures: BTreeSet<[u32; 2]> =
+        test.images.iter().map(|picture| [picture.width, picture.height]).collect();
     let total: f64 = stages.iter().map(|time| time.seconds).sum();
     let floor = floor::floor_cpu_seconds(needed);
     let is_cpu = gpu.adapter().is_cpu;
@@ -345,10 +355,13 @@ fn main() -> Fallible<()> {
         .collect();
     let result = serde_json::json!({
         "adapter": gpu.adapter().name,
+        "driver": gpu.adapter().driver,
         "iterations": config.iterations,
         "gaussians": model.len(),
+        "pictures": pictures,
         "psnr": psnr,
         "ssim": ssim,
+        "wall_seconds": wall,
         "wall_seconds_per_step": wall / f64::from(last.max(1)),
         "cpu_seconds_per_step": cpu / f64::from(last.max(1)),
         "bytes_per_gaussian": memory.gaussians as f64 / f64::from(config.max_gaussians),
@@ -371,6 +384,7 @@ fn main() -> Fallible<()> {
         "viewer_psnr": clear.map(|(_, viewer)| viewer),
         "water_steps_left_out": trainer.water_steps_left_out()?,
         "list_capacities": trainer.list_capacities(),
+        "process_peak_bytes": process_peak_bytes(),
         "device_peak_bytes": device.map(|memory| memory.peak_bytes),
         "forecast": forecast,
         "forecast_bytes": forecast.total(),

@@ -43,3 +43,12 @@ fn every_shader_file_is_a_stage() {
     let stages: BTreeSet<String> = kernel_names().map(str::to_owned).collect();
     assert_eq!(files, stages);
 }
+
+#[test]
+fn the_readme_lists_exactly_the_stages() {
+    let file = concat!(env!("CARGO_MANIFEST_DIR"), "/../shaders/README.md");
+    let readme = std::fs::read_to_string(file).expect("the README of the shaders");
+    let listed: BTreeSet<&str> =
+        readme.lines().filter_map(|line| line.strip_prefix("| `")?.split('`').next()).collect();
+    assert_eq!(listed, kernel_names().collect(), "shaders/README.md (left) and the stages");
+}

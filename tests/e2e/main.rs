@@ -9,6 +9,8 @@ mod datasets;
 mod drivers;
 #[cfg(unix)]
 mod faults;
+#[cfg(unix)]
+mod gpu_kit;
 mod held_out;
 mod hostile;
 #[cfg(unix)]

@@ -33,6 +33,9 @@ pub struct SynthArgs {
     /// Size of a photograph
     #[arg(long, value_name = "WxH", default_value = "240x180", value_parser = parse_size)]
     size: (u32, u32),
+    /// Pixels of each photograph where a sparse point is tried; fewer become points
+    #[arg(long, value_name = "N", default_value_t = SynthOptions::default().points_per_view)]
+    points_per_view: u32,
     /// Print a summary as JSON
     #[arg(long)]
     json: bool,
@@ -56,7 +59,14 @@ pub fn run(args: SynthArgs) -> Result<()> {
         Whereto::Down => SynthOptions::default(),
         Whereto::Forward => SynthOptions::forward(),
     };
-    let sized = SynthOptions { seed: args.seed, views: args.views, width, height, ..of_look };
+    let sized = SynthOptions {
+        seed: args.seed,
+        views: args.views,
+        width,
+        height,
+        points_per_view: args.points_per_view,
+        ..of_look
+    };
     let options = match args.water {
         Switch::On => sized,
         Switch::Off => SynthOptions { water: Water::CLEAR, by_direction: None, ..sized },

@@ -11,6 +11,10 @@
 //! The camera is at the origin and looks along z. Its focal length is 0.9 of the width, so that a picture of
 //! 16:9 shows all Gaussians.
 
+use std::fs::File;
+use std::io::{self, BufWriter, Write};
+use std::path::Path;
+
 use fathom_core::gaussians::Gaussians;
 use fathom_core::rng::{Stream, uniform_at};
 use fathom_core::scene::{PinholeCamera, Pose};
@@ -44,4 +48,38 @@ pub fn camera(width: u32, height: u32) -> (PinholeCamera, Pose) {
         cy: f64::from(height) / 2.0,
     };
     (camera, Pose::from_wxyz([1.0, 0.0, 0.0, 0.0], [0.0; 3]))
+}
+
+/// Writes the scene for a program that shares no code with this one. A line of JSON has the counts and the
+/// camera. After it come, as little-endian f32, all means, quaternions (w first), log scales, opacity logits
+/// and coefficients. A coefficient has its three channels next to each other.
+#[allow(dead_code, reason = "not every program that has this scene writes it")]
+pub fn write(file: &Path, n: u32, width: u32, height: u32) -> io::Result<()> {
+    let model = model(n);
+    let (camera, _) = camera(width, height);
+    let header = serde_json::json!({
+        "gaussians": n,
+        "sh_degree": 3,
+        "width": width,
+        "height": height,
+        "fx": camera.fx,
+        "fy": camera.fy,
+        "cx": camera.cx,
+        "cy": camera.cy,
+        // World to camera, by rows: the camera is at the origin and looks along z.
+        "viewmat": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1],
+    });
+    let mut out = BufWriter::new(File::create(file)?);
+    writeln!(out, "{header}")?;
+    let lists: [&[f32]; 5] = [
+        bytemuck::cast_slice(&model.means),
+        bytemuck::cast_slice(&model.quats),
+        bytemuck::cast_slice(&model.log_scales),
+        &model.opacity_logits,
+        bytemuck::cast_slice(&model.sh_coeffs),
+    ];
+    for value in lists.into_iter().flatten() {
+        out.write_all(&value.to_le_bytes())?;
+    }
+    out.flush()
 }

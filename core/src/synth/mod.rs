@@ -115,6 +115,9 @@ pub struct SynthOptions {
     pub width: u32,
     /// Rows of a photograph.
     pub height: u32,
+    /// Pixels of each photograph where a sparse point is tried. Fewer become points: those on a surface with
+    /// texture that another photograph sees too.
+    pub points_per_view: u32,
     /// The water between camera and wreck; a scene unit is a metre.
     pub water: Water,
     /// How the colour of open water changes with direction, scene axes; `None` if it is constant.
@@ -124,7 +127,16 @@ pub struct SynthOptions {
 impl Default for SynthOptions {
     fn default() -> Self {
         let water = Water::COASTAL;
-        Self { look: Look::Down, seed: 1, views: 72, width: 240, height: 180, water, by_direction: None }
+        Self {
+            look: Look::Down,
+            seed: 1,
+            views: 72,
+            width: 240,
+            height: 180,
+            points_per_view: 90,
+            water,
+            by_direction: None,
+        }
     }
 }
 
@@ -147,6 +159,14 @@ impl SynthOptions {
             let (width, height) = (self.width, self.height);
             return Err(CoreError::Config(format!(
                 "--size is {width}x{height}; each side must be 16 to 8192"
+            )));
+        }
+        let most = u32::MAX / self.views;
+        if !(1..=100_000).contains(&self.points_per_view) || self.points_per_view > most {
+            return Err(CoreError::Config(format!(
+                "--points-per-view is {}; it must be 1 to {}",
+                self.points_per_view,
+                most.min(100_000)
             )));
         }
         if !self.water.is_physical() {
@@ -231,7 +251,7 @@ pub fn synthesise(
         })
         .collect::<Result<Vec<_>>>()?;
 
-    let points = points::sparse_points(&world, &camera, &poses, &photographs, options.seed);
+    let points = points::sparse_points(&world, &camera, &poses, &photographs, options);
     files::write_colmap(&out.join("sparse/0"), &camera, &names, &poses, &points)?;
     let depths: Vec<_> = (0..poses.len())
         .into_par_iter()

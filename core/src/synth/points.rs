@@ -5,12 +5,10 @@ use glam::DVec3;
 use rayon::prelude::*;
 
 use super::geometry::{Ray, World};
-use super::{Photograph, pixel_ray};
+use super::{Photograph, SynthOptions, pixel_ray};
 use crate::rng::{Stream, random_bits, uniform};
 use crate::scene::{PinholeCamera, Pose};
 
-/// Candidate points of each view.
-const PER_VIEW: u32 = 90;
 /// Error of a point across the line of sight, pixels, one standard deviation.
 pub(super) const ERROR_PX: f64 = 0.3;
 
@@ -27,14 +25,15 @@ pub(super) fn sparse_points(
     camera: &PinholeCamera,
     poses: &[Pose],
     photographs: &[Photograph],
-    seed: u32,
+    options: &SynthOptions,
 ) -> Vec<SparsePoint> {
-    (0..poses.len() as u32 * PER_VIEW)
+    let SynthOptions { seed, points_per_view, .. } = *options;
+    (0..poses.len() as u32 * points_per_view)
         .into_par_iter()
         .filter_map(|candidate| {
-            let view = candidate / PER_VIEW;
+            let view = candidate / points_per_view;
             let pose = &poses[view as usize];
-            let random = random_bits(seed, Stream::Synth, 20_000 + view, candidate % PER_VIEW)
+            let random = random_bits(seed, Stream::Synth, 20_000 + view, candidate % points_per_view)
                 .map(|b| f64::from(uniform(b)));
             let pixel = [random[0] * f64::from(camera.width), random[1] * f64::from(camera.height)];
             let ray = Ray { origin: pose.centre(), direction: pixel_ray(camera, pose, pixel) };
@@ -62,7 +61,7 @@ pub(super) fn sparse_points(
             });
             let colour = sum.map(|s| ((s as f64 / track.len() as f64).round()) as u8);
             let spread = ERROR_PX * hit.range / camera.fx;
-            let error = super::normal_numbers(seed, 30_000 + view, candidate % PER_VIEW);
+            let error = super::normal_numbers(seed, 30_000 + view, candidate % points_per_view);
             Some(SparsePoint { position: surface + error * spread, colour, track })
         })
         .collect()

@@ -110,7 +110,7 @@ fn every_sparse_point_projects_to_its_track() {
     let poses = survey::poses(options.views, options.seed);
     let photographs: Vec<_> =
         (0..poses.len()).map(|v| Photograph::take(&world, &camera, &poses[v], v as u32, &options)).collect();
-    let points = points::sparse_points(&world, &camera, &poses, &photographs, options.seed);
+    let points = points::sparse_points(&world, &camera, &poses, &photographs, &options);
     assert!(points.len() > 300, "{} points", points.len());
     for point in &points {
         assert!(point.track.len() >= 2);
@@ -267,7 +267,7 @@ fn looking_forward_points_have_several_ranges_and_texture() {
     }
     let photographs: Vec<_> =
         (0..poses.len()).map(|v| Photograph::take(&world, &camera, &poses[v], v as u32, &options)).collect();
-    let points = points::sparse_points(&world, &camera, &poses, &photographs, options.seed);
+    let points = points::sparse_points(&world, &camera, &poses, &photographs, &options);
     assert!(points.len() > 3000, "{} points", points.len());
     let mut from_several = 0;
     for point in &points {
