@@ -308,6 +308,43 @@ step() {
     at_least 0.44 "$(number cpu_seconds_per_step "$(target_folder)/bench/peers.json")" || miss "a step of fox costs more than 0.44 CPU s"
 }
 
+# VkSplat's own program and ours on the same photographs, in turns. Both begin with 10,000 points and SH 3 and
+# grow to 13,500 Gaussians by step 350. VkSplat's shaders are compiled for a CPU driver, which has no float
+# atomics (scripts/peers/vksplat.sh says what is changed).
+vksplat() {
+    have fox && on_a_cpu vksplat || return 0
+    local turn theirs=() settings=(--max-resolution 400 --max-gaussians 13500 --initial-points 10000 --iterations 600
+        --evaluate-every 100 --resolution-at '[0,0]' --sh-degree-at '[0,0,0]' --background-gaussians 0)
+    scripts/peers/vksplat.sh build --fallback 2>"$out/vksplat-build.log" ||
+        { miss "VkSplat does not build, see $out/vksplat-build.log"; return 0; }
+    for turn in ours theirs theirs ours; do
+        if [ "$turn" = ours ]; then
+            trainer vksplat-ours "$scenes/fox" "${settings[@]}" || return 0
+            at_steps "fox/ours" "train_scene fox ${settings[*]}" "$out/vksplat-ours.json"
+        else
+            theirs=(--steps 600 --cap 13500 --initial-points 10000 --width-limit 400 --evaluate-at 100,300,600
+                --sh-interval 1 --refine-start 0 --refine-every 50)
+            python3 scripts/peers/vksplat.py "$scenes/fox" "${theirs[@]}" >"$out/vksplat.json" 2>"$out/vksplat.log" ||
+                { miss "VkSplat fails, see $out/vksplat.log"; return 0; }
+            at_steps "fox/VkSplat" "scripts/peers/vksplat.py fox ${theirs[*]}" "$out/vksplat.json"
+        fi
+    done
+    awk -v ours="$(number cpu_seconds_per_step "$out/vksplat-ours.json")" \
+        -v theirs="$(number cpu_seconds_per_step "$out/vksplat.json")" 'BEGIN { exit !(ours < theirs) }' ||
+        miss "a step of VkSplat is cheaper than ours"
+}
+at_steps() { # scene/variant, command, file with cpu_seconds_per_step and held_out
+    local said cpu at_100 at_300 at_600
+    said=$(python3 -c 'import json, sys
+result = json.load(open(sys.argv[1]))
+reached = {row.get("step", row.get("iteration")): row["psnr"] for row in result["held_out"]}
+reached.setdefault(600, result.get("psnr"))
+print("%.4f %.3f %.3f %.3f" % (result["cpu_seconds_per_step"], *(reached[step] for step in (100, 300, 600))))' "$3")
+    read -r cpu at_100 at_300 at_600 <<<"$said"
+    row "$1" "$2" "$cpu CPU s a step; $at_100, $at_300, $at_600 dB after 100, 300, 600 steps" "cpu_s_per_step=$cpu" \
+        "psnr_100=$at_100" "psnr_300=$at_300" "psnr=$at_600" "current=$cpu CPU s a step; $at_100, $at_300, $at_600 dB"
+}
+
 # Quality per CPU time, against OpenSplat's 27.88 dB in 219 CPU seconds: 28 dB in 220, with a target of 110.
 quality_for_time() {
     have fox && on_a_cpu quality_for_time || return 0
@@ -699,7 +736,7 @@ demo() {
         "current=$(brief "$out/demo/result/metrics.json"); trained in $(sed -nE 's/^time:.* training ([0-9]+) s.*/\1/p' "$out/demo.log") s"
 }
 
-all='plans plan_scale merge_scale partitions readers demo fox other_programs speed step quality_for_time reef_360 fox_moments reef wreck water water_long sparse_waters other_waters viewer_colours reef_water
+all='plans plan_scale merge_scale partitions readers demo fox other_programs speed step vksplat quality_for_time reef_360 fox_moments reef wreck water water_long sparse_waters other_waters viewer_colours reef_water
 open_water fox_long wreck_full
 twelve_million drivers memory_1m'
 for figure in ${1:-$all}; do

@@ -478,9 +478,11 @@ def peer_mcmc(kit, peer):
     """A peer on the same files, from as many points."""
     ready(kit, peer)
     settings, folder = kit.settings["mcmc"], large_scene(kit)
-    words = [folder, "--steps", settings["steps"], "--cap", settings["cap"], "--initial-points", settings["cap"]]
-    said = gsplat(kit, "train", *words, seconds=300) if peer == "gsplat" else vksplat(kit, *words, seconds=300)
-    result = json.loads(said)
+    words = [folder, "--steps", settings["steps"], "--cap", settings["cap"]]
+    if peer == "gsplat":
+        result = json.loads(gsplat(kit, "train", *words, "--points", settings["cap"], seconds=300))
+    else:
+        result = json.loads(vksplat(kit, *words, "--initial-points", settings["cap"], seconds=300))
     each = result["ms_per_step"] / 1e3 if peer == "gsplat" else result["wall_seconds_per_step"]
     psnr = result["psnr"] if peer == "gsplat" else result["held_out"][-1]["psnr"]
     kit.row("gpu_mcmc", "synth", peer, f"{peer} --steps {settings['steps']} --cap {settings['cap']}",

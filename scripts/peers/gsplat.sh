@@ -23,9 +23,9 @@ here=$(cd "$(dirname "$0")" && pwd)
 
 fail() { printf 'gsplat: %s\n' "$1" >&2; exit "${2:-1}"; }
 
-# The commit of a checkout, or "unknown" for a folder that is not one.
+# The commit of a checkout, or what a packed folder says; "unknown" for any other.
 commit_of() {
-    if [ -e "$1/.git" ]; then git -C "$1" rev-parse HEAD; else printf 'unknown\n'; fi
+    if [ -e "$1/.git" ]; then git -C "$1" rev-parse HEAD; else cat "$1/COMMIT" 2>/dev/null || printf 'unknown\n'; fi
 }
 
 clone() {
@@ -109,11 +109,15 @@ run() {
     PYTHONPATH=$path${PYTHONPATH:+:$PYTHONPATH} "$python" "$here/gsplat_bench.py" "$@"
 }
 
-verb=${1:-} folder=${2:-}
-[ -n "$folder" ] || fail "usage: gsplat.sh pack|build|run FOLDER [ARGS...]"
-case $verb in
-    pack) pack "$folder" ;;
-    build) build "$folder" ;;
-    run) shift; run "$@" ;;
-    *) fail "usage: gsplat.sh pack|build|run FOLDER [ARGS...]" ;;
-esac
+main() {
+    local verb=${1:-} folder=${2:-}
+    [ -n "$folder" ] || fail "usage: gsplat.sh pack|build|run FOLDER [ARGS...]"
+    case $verb in
+        pack) pack "$folder" ;;
+        build) build "$folder" ;;
+        run) shift; run "$@" ;;
+        *) fail "usage: gsplat.sh pack|build|run FOLDER [ARGS...]" ;;
+    esac
+}
+
+main "$@"

@@ -3,6 +3,8 @@
 #
 #     scripts/peers/vksplat.sh build [--native]       with the SPIR-V that VkSplat ships, for real GPUs
 #     scripts/peers/vksplat.sh build --fallback       with its shaders compiled for lavapipe, a CPU driver
+#     scripts/peers/vksplat.sh pack FOLDER            copies what a build elsewhere needs: FOLDER/source for
+#                                                     VKSPLAT_SOURCE, FOLDER/include for both headers
 #
 # The result goes to PEERS_OUT (default: target/peers/vksplat). Its folder `source` is the patched copy.
 #
@@ -25,9 +27,10 @@ lanes=${SUBGROUP_SIZE:-8}
 say() { printf 'vksplat: %s\n' "$*" >&2; }
 stop() { say "$@"; exit 1; }
 
-# Its sources, without what an earlier build left there.
-sources() {
-    local from=${VKSPLAT_SOURCE:-} have
+# Finds its sources, or clones them.
+find_sources() {
+    local have
+    from=${VKSPLAT_SOURCE:-}
     if [ -z "$from" ]; then
         from=$out/clone
         if [ ! -e "$from/.git" ]; then
@@ -43,10 +46,14 @@ sources() {
     if [ -e "$from/.git" ] && [ "$have" != "$COMMIT" ]; then
         stop "$from is at $have, not at $COMMIT"
     fi
-    rm -rf "$out/source"
-    mkdir -p "$out/source"
-    cp -r "$from/vksplat" "$from/compile_shaders.py" "$from/LICENSE" "$out/source/"
-    chmod -R u+w "$out/source"
+}
+
+# A copy of its sources, without what an earlier build left there.
+copy_sources() { # folder
+    rm -rf "$1"
+    mkdir -p "$1"
+    cp -r "$from/vksplat" "$from/compile_shaders.py" "$from/LICENSE" "$1/"
+    chmod -R u+w "$1"
 }
 
 # A Python with the packages that the build and vksplat.py need.
@@ -133,7 +140,7 @@ find_slangc() {
     if [ -z "$slangc" ]; then
         slangc=$out/slang/slangtorch/bin/slangc
         if [ ! -e "$slangc" ]; then
-            say "fetching slangtorch (13 MB) for its Slang compiler"
+            say "fetching slangtorch (15 MB) for its Slang compiler"
             "$python" -m pip install --quiet --disable-pip-version-check --no-deps --target "$out/slang" \
                 slangtorch==1.3.22 || stop "there is no slangc; set SLANGC"
         fi
@@ -263,7 +270,8 @@ build() {
     mkdir -p "$out"
     # vksplat.py takes this file for a complete build.
     rm -f "$out/build.json"
-    sources
+    find_sources
+    copy_sources "$out/source"
     python_with_packages
     vulkan=$(headers vulkan/vulkan.h "${VULKAN_HEADERS:-}" VULKAN_HEADERS libvulkan-dev)
     glm=$(headers glm/glm.hpp "${GLM_HEADERS:-}" GLM_HEADERS libglm-dev)
@@ -300,7 +308,20 @@ PYTHON
     say "built $out/vksplat$suffix ($kind)"
 }
 
+pack() {
+    local into=${1:-} vulkan glm
+    [ -n "$into" ] || stop "usage: vksplat.sh pack FOLDER"
+    find_sources
+    copy_sources "$into/source"
+    vulkan=$(headers vulkan/vulkan.h "${VULKAN_HEADERS:-}" VULKAN_HEADERS libvulkan-dev)
+    glm=$(headers glm/glm.hpp "${GLM_HEADERS:-}" GLM_HEADERS libglm-dev)
+    mkdir -p "$into/include/vulkan"
+    cp "$vulkan"/vulkan/*.h "$into/include/vulkan/"
+    cp -r "$vulkan/vk_video" "$glm/glm" "$into/include/"
+}
+
 case "${1:-}" in
     build) build "${@:2}" ;;
-    *) sed -n '2,16p' "$0"; exit 2 ;;
+    pack) pack "${@:2}" ;;
+    *) sed -n '2,19p' "$0"; exit 2 ;;
 esac
