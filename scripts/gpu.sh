@@ -99,7 +99,7 @@ settings() {
   "stages": {"1m": [2000, 96, 54], "3m": [3000, 96, 54]},
   "fox": {"iterations": 20, "max_gaussians": 2000, "max_resolution": 64, "minute": 1},
   "wreck": {"iterations": 20, "max_gaussians": 2000, "max_resolution": 64},
-  "mcmc": {"steps": 20, "cap": 2000, "views": 10, "size": "64x48", "points_per_view": 300}'
+  "mcmc": {"steps": 20, "cap": 2000, "views": 10, "size": "64x48", "points_per_view": 400}'
     fi
     cat <<JSON
 { "version": "$(sed -nE 's/^version = "(.*)"/\1/p' Cargo.toml | head -n 1)",
