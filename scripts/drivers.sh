@@ -249,7 +249,7 @@ case "${1:-all}" in
     all) shift "$#" ;;
     fetch) fetch || { say "SwiftShader is not at hand: chromium-common is neither installed nor can be fetched"; exit 1; }; exit 0 ;;
     kernels | first | train | validation | memory) parts=("$1"); shift ;;
-    *) sed -n '2,22p' "$0"; exit 2 ;;
+    *) sed -n '2,23p' "$0"; exit 2 ;;
 esac
 drivers=("${@:-${ALL[@]}}")
 [ "$#" -gt 0 ] || drivers=("${ALL[@]}")

@@ -14,6 +14,8 @@
 # FATHOM_GPU_PROGRAMS   a folder of programs that are built already
 set -euo pipefail
 cd "$(dirname "$0")/.."
+# ldconfig is not on the PATH of every user.
+PATH=$PATH:/usr/sbin:/sbin
 
 MOST_MIB=50
 GLIBC=2.36

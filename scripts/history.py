@@ -99,6 +99,7 @@ def append(figure, command, values=None, **more):
 
 def write_rows(rows):
     """Adds whole rows at the end of the history."""
+    lines = [json.dumps(row, ensure_ascii=False, allow_nan=False).encode() + b"\n" for row in rows]
     path = history_path()
     path.parent.mkdir(parents=True, exist_ok=True)
     with open(path, "a+b") as file:
@@ -107,8 +108,7 @@ def write_rows(rows):
             file.seek(-1, os.SEEK_END)
             if file.read(1) != b"\n":
                 file.write(b"\n")
-        for row in rows:
-            file.write(json.dumps(row, ensure_ascii=False, allow_nan=False).encode() + b"\n")
+        file.write(b"".join(lines))
 
 
 def read(path=None):
@@ -177,7 +177,12 @@ def merge(folder):
     if not path.is_file():
         sys.exit(f"history: {path} is not there; name the folder of results that the kit wrote")
     have = {json.dumps(row, sort_keys=True) for row in read()}
-    new = [row for row in read(path) if json.dumps(row, sort_keys=True) not in have]
+    new = []
+    for row in read(path):
+        text = json.dumps(row, sort_keys=True)
+        if text not in have:
+            have.add(text)
+            new.append(row)
     write_rows(new)
     if table := gpu_table(read()):
         replace_between(*GPU_MARKERS, table, gpu_path())
@@ -189,7 +194,7 @@ def gpu_table(rows):
     newest = {}
     for row in rows:
         shown = row["figure"] in ("gpu_scene", "gpu_mcmc") or row["figure"] == "gpu_gsplat" and "sum" in row.get("variant", "")
-        if shown and row.get("values"):
+        if shown and row.get("values") and not row.get("settings", {}).get("rehearsal"):
             newest[row.get("adapter", ""), row["figure"], row.get("scene", ""), row.get("variant", "")] = row
     if not newest:
         return ""
@@ -320,8 +325,10 @@ def check():
         gpu_path().write_text(f"a\n{GPU_MARKERS[0]}\nnone\n{GPU_MARKERS[1]}\nb\n")
         row = {"date": "2026-01-03", "commit": "c", "figure": "gpu_scene", "scene": "fox", "command": "train_scene fox",
                "adapter": "Card (1.2)", "values": {"psnr": 33.456, "wall_s": 60}}
-        (Path(folder) / "rows.jsonl").write_text(json.dumps(row) + "\n")
-        assert (merge(folder), merge(folder)) == (1, 0), "a row was lost or added twice"
+        tried = {**row, "adapter": "llvmpipe", "settings": {"rehearsal": True}}
+        (Path(folder) / "rows.jsonl").write_text("".join(json.dumps(each) + "\n" for each in (tried, row, row)))
+        assert (merge(folder), merge(folder)) == (2, 0), "a row was lost or added twice"
+        assert "llvmpipe" not in gpu_path().read_text(), "a rehearsal is shown as a card"
         assert read()[-1] == row
         assert "| Card | `gpu_scene` fox | 33.46 dB, 60.0 s | 2026-01-03 |\n" in gpu_path().read_text()
         picture = Path(folder) / "plot.svg"

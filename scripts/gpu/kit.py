@@ -30,8 +30,9 @@ import time
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
-# Bytes a second that the vendor names for the memory of a card, in 1e9.
-PEAK_BANDWIDTH = {"H200": 4800, "H100 PCIe": 2039, "H100": 3350, "A100": 2039, "L40S": 864, "4090": 1008, "3090": 936}
+# Bytes a second that the vendor names for the memory of a card, in 1e9; the first name that fits counts.
+PEAK_BANDWIDTH = {"GH200": 4000, "H200": 4800, "H100 PCIe": 2039, "H100 NVL": 3938, "H100": 3350, "A100-SXM4-80": 2039,
+                  "A100 80": 1935, "A100": 1555, "L40S": 864, "RTX 4090": 1008, "RTX 3090": 936}
 # Kernels of Fathom and stages of gsplat that do the same work. Fathom's other kernels are those of the tiles.
 # Of gsplat's two forms of Adam, the faster one counts.
 COMPARED = {
@@ -47,7 +48,11 @@ ADAM = "project backward, Adam", ("adam_fused", "adam_selective")
 
 
 class Failed(Exception):
-    """A part has no result; the text says why."""
+    """A part has no result; the text says why. `out` is what a command had written."""
+
+    def __init__(self, why, out=""):
+        super().__init__(why)
+        self.out = out
 
 
 class Kit:
@@ -57,10 +62,11 @@ class Kit:
         self.settings = json.loads((HERE / "kit.json").read_text())
         self.out, self.limit, self.allow_cpu = out, limit, allow_cpu
         self.begin = time.monotonic()
-        self.work = out / "work"
+        # Beside the results, which are few and small.
+        self.work = HERE / "work"
         self.work.mkdir(parents=True, exist_ok=True)
         self.environment = dict(os.environ)
-        self.adapter = None
+        self.adapter, self.is_cpu = None, False
         self.events = []
         self.part = None
         self.background = {}
@@ -99,11 +105,14 @@ class Kit:
             os.killpg(process.pid, signal.SIGKILL)
             out, err = process.communicate()
             self.log(out + err)
-            raise Failed(f"{Path(command[0]).name} was stopped after {seconds:.0f} s") from None
+            raise Failed(f"{Path(command[0]).name} was stopped after {seconds:.0f} s", out) from None
+        except KeyboardInterrupt:
+            os.killpg(process.pid, signal.SIGKILL)
+            raise
         self.log(out + err)
         if process.returncode != 0:
             last = (err.strip() or out.strip() or "no output").splitlines()[-1]
-            raise Failed(f"{Path(command[0]).name} failed ({process.returncode}): {last}")
+            raise Failed(f"{Path(command[0]).name} failed ({process.returncode}): {last}", out)
         return out
 
     def program(self, name, *arguments, **more):
@@ -114,6 +123,8 @@ class Kit:
         row = {"date": datetime.datetime.now(datetime.timezone.utc).date().isoformat(),
                "commit": self.settings["commit"], "figure": figure, "scene": scene, "variant": variant,
                "command": command, "adapter": self.adapter or "none",
+               # Such figures say nothing about a GPU.
+               "settings": {"rehearsal": True} if self.settings["rehearsal"] or self.is_cpu else {},
                "values": {key: value for key, value in values.items() if value is not None}, "note": note}
         with open(self.out / "rows.jsonl", "a", encoding="utf-8") as file:
             file.write(json.dumps({key: value for key, value in row.items() if value not in (None, "", {})}) + "\n")
@@ -148,11 +159,16 @@ class Sampler(threading.Thread):
         while not self.ended.wait(0.25):
             try:
                 text = subprocess.run(query, capture_output=True, text=True, timeout=10, check=True).stdout
-                values = [float(value) for value in text.splitlines()[0].split(",")]
-            except (OSError, ValueError, IndexError, subprocess.SubprocessError):
+                texts = text.splitlines()[0].split(",")
+            except (OSError, IndexError, subprocess.SubprocessError):
                 continue
-            self.peak = max(self.peak, values[0])
-            for name, value in zip(self.FIELDS, values):
+            for name, text in zip(self.FIELDS, texts):
+                try:
+                    value = float(text)
+                except ValueError:
+                    continue  # [N/A]
+                if name == "memory.used":
+                    self.peak = max(self.peak, value)
                 self.kit.events.append({"name": name, "ph": "C", "ts": self.kit.now() * 1e6, "pid": 1,
                                         "args": {name: value}})
 
@@ -226,6 +242,7 @@ def find_gpu(kit):
     files, adapter = (gpus or seen)[0]
     if files:
         kit.environment.update(VK_DRIVER_FILES=files, VK_ICD_FILENAMES=files)
+    kit.is_cpu = adapter["is_cpu"]
     kit.adapter = f"{adapter['name']} ({adapter['driver']})"
     kit.say(f"adapter: {kit.adapter}, driver file {files or 'of the system'}")
 
@@ -236,13 +253,11 @@ def tests(kit, name, seconds):
     """Runs a test program; a failure of some tests is a result too."""
     arguments = kit.settings.get(f"{name}_filter", [])
     try:
-        out = kit.program(name, *arguments, seconds=seconds)
-        failed = ""
+        out, failed = kit.program(name, *arguments, seconds=seconds), ""
     except Failed as error:
-        out = (kit.out / "log.txt").read_text(encoding="utf-8", errors="replace")
-        failed = str(error)
+        out, failed = error.out, str(error)
     counts = re.findall(r"(\d+) passed; (\d+) failed", out)
-    if not counts or "was stopped" in failed:
+    if not counts:
         raise Failed(failed or "no test ran")
     passed, bad = map(int, counts[-1])
     names = re.findall(r"^test (\S+) \.\.\. FAILED", out, re.MULTILINE)
@@ -288,26 +303,32 @@ def bytes_again(kit):
         digests.append((kit.work / name / "model.ply").read_bytes())
     same = all(model == digests[0] for model in digests)
     psnr = json.loads(kit.program("fathom", "eval", kit.work / "once", "--json"))["psnr"]
-    kit.row("gpu_checks", "synth", "bytes", "fathom train, twice and resumed", {"same_bytes": int(same), "runs": len(digests), "psnr": psnr})
+    kit.row("gpu_checks", "synth", "bytes", "fathom train, twice and resumed", {"same_bytes": int(same), "runs": len(digests), "resumed_from": resumed, "psnr": psnr},
+            "" if resumed else "no run was stopped in its middle")
     if not same:
         raise Failed("runs with one seed on one device have different models")
 
 
 def stopped_and_resumed(kit, scene, settings):
-    """False if the run ended before it could be stopped."""
-    for after in (2.0, 1.0, 0.5, 0.25):
-        into = kit.work / "resumed"
+    """The iteration at which a stopped run went on; None if every run ended, or was stopped too early."""
+    into = kit.work / "resumed"
+    for after in (4.0, 3.0, 2.0, 1.0, 0.5):
         shutil.rmtree(into, ignore_errors=True)
         command = [str(word) for word in (HERE / "bin/fathom", "train", scene, "-o", into, *settings)]
         process = subprocess.Popen(command, env=kit.environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         time.sleep(after)
         process.send_signal(signal.SIGINT)
-        process.wait(timeout=60)
-        if not (into / "model.ply").exists():
-            # Without a checkpoint yet the run begins again, which proves less but must work.
-            kit.program("fathom", "train", scene, "-o", into, *settings, *(["--resume"] if into.exists() else []))
-            return True
-    return False
+        try:
+            process.wait(timeout=60)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            raise Failed("a training does not stop on Ctrl-C") from None
+        if not (into / "model.ply").exists() and into.exists():
+            kit.program("fathom", "train", scene, "-o", into, *settings, "--resume")
+            tasks = json.loads((into / "run.json").read_text())["tasks"]
+            if resumed := max(task["resumed_from_iteration"] for task in tasks):
+                return resumed
+    return None
 
 
 def validation(kit):
@@ -355,10 +376,11 @@ def random_scene(kit, which):
 def stages(kit, which):
     """Device time of each kernel of a step over random Gaussians."""
     gaussians, width, height = kit.settings["stages"][which]
-    file = random_scene(kit, which)
     begin = kit.now()
-    out = kit.program("bench_random", gaussians, width, height, "--write-scene", file, "--repeats",
-                      kit.settings["repeats"], "--entries", kit.settings["entries"], seconds=150)
+    # Hundreds of megabytes, which only gsplat needs.
+    written = ["--write-scene", random_scene(kit, which)] if (HERE / "peers/gsplat").is_dir() else []
+    out = kit.program("bench_random", gaussians, width, height, *written, "--repeats", kit.settings["repeats"], "--entries",
+                      kit.settings["entries"], seconds=150)
     result = json.loads(out)
     (kit.work / f"stages-{which}.json").write_text(out)
     peak = next((rate for name, rate in PEAK_BANDWIDTH.items() if name in kit.adapter), None)
@@ -478,17 +500,20 @@ def peer_mcmc(kit, peer):
     """A peer on the same files, from as many points."""
     ready(kit, peer)
     settings, folder = kit.settings["mcmc"], large_scene(kit)
-    words = [folder, "--steps", settings["steps"], "--cap", settings["cap"]]
+    words = [folder, "--steps", settings["steps"], "--cap", settings["cap"],
+             # As in `mcmc`: SH 3 from the first step, and a schedule that ends with the run (VkSplat's does).
+             "--sh-interval", 1]
     if peer == "gsplat":
-        result = json.loads(gsplat(kit, "train", *words, "--points", settings["cap"], seconds=300))
+        words += ["--points", settings["cap"], "--schedule-steps", settings["steps"]]
+        result = json.loads(gsplat(kit, "train", *words, seconds=300))
     else:
         result = json.loads(vksplat(kit, *words, "--initial-points", settings["cap"], seconds=300))
     each = result["ms_per_step"] / 1e3 if peer == "gsplat" else result["wall_seconds_per_step"]
     psnr = result["psnr"] if peer == "gsplat" else result["held_out"][-1]["psnr"]
     kit.row("gpu_mcmc", "synth", peer, f"{peer} --steps {settings['steps']} --cap {settings['cap']}",
             {"psnr": psnr, "wall_s": each * settings["steps"], "ms_per_step": 1e3 * each,
-             "gaussians": result["gaussians"], "peak_bytes": result.get("peak_bytes"), "card_peak_bytes": kit.sampler.peak_bytes()},
-            f"{peer} {result['commit'][:7]}")
+             "gaussians": result["gaussians"], "peak_bytes": result.get("peak_bytes") or result.get("peak_device_bytes"),
+             "card_peak_bytes": kit.sampler.peak_bytes()}, f"{peer} {result['commit'][:7]}, SSIM {result.get('ssim', 'its own')}")
     kit.row("gpu_mcmc", "synth", f"{peer}, 30k computed", f"{settings['steps']} steps, times 30000 / {settings['steps']}",
             {"wall_s": 30_000 * each})
 
@@ -523,9 +548,10 @@ def prepare(kit, needs):
         if need == "scene":
             shutil.rmtree(kit.work / "large", ignore_errors=True)
         log = open(kit.work / f"{need}.log", "w", encoding="utf-8")
+        # A few CPUs stay free for the parts that run meanwhile.
         kit.background[need] = subprocess.Popen(
-            [str(word) for word in commands[need]], stdout=log, stderr=subprocess.STDOUT, start_new_session=True, cwd=kit.work,
-            env={**kit.environment, "PEERS_OUT": str(kit.work / "vksplat"), "VKSPLAT_SOURCE": str(packed / "source"),
+            ["nice", "-n", "19", *(str(word) for word in commands[need])], stdout=log, stderr=subprocess.STDOUT, start_new_session=True, cwd=kit.work,
+            env={**kit.environment, "MAX_JOBS": str(max(1, (os.cpu_count() or 1) - 4)), "PEERS_OUT": str(kit.work / "vksplat"), "VKSPLAT_SOURCE": str(packed / "source"),
                  "VULKAN_HEADERS": str(packed / "include"), "GLM_HEADERS": str(packed / "include")})
         kit.say(f"{need}: being made in the background")
 
@@ -549,8 +575,21 @@ def ready(kit, need):
     (kit.work / f"{need}.made").touch()
 
 
+def settle(kit):
+    """Waits until nothing is made in the background, before a part whose wall time counts."""
+    for need, process in kit.background.items():
+        if not isinstance(process, str) and process.poll() is None:
+            kit.say(f"waiting for {need}, which is being made")
+            try:
+                ready(kit, need)
+            except Failed as error:
+                kit.say(str(error))
+
+
 # Name: kind, least seconds that must be left, what it needs from `prepare`, function. The least seconds are
-# not what a part takes: they keep one from starting that has no chance.
+# not what a part takes: they keep one from starting that has no chance. Stages are timed by the device, so
+# they may run while something is made in the background.
+WALL_TIMES = ("fox", "wreck", "mcmc", "vksplat-mcmc", "gsplat-mcmc")
 PARTS = {
     "kernels": ("checks", 60, (), kernels),
     "device": ("checks", 20, (), device),
@@ -558,10 +597,10 @@ PARTS = {
     "bytes": ("checks", 30, (), bytes_again),
     "validation": ("checks", 40, (), validation),
     "stages-1m": ("times", 40, (), lambda kit: stages(kit, "1m")),
+    "stages-3m": ("times", 50, (), lambda kit: stages(kit, "3m")),
+    "mcmc": ("times", 90, ("scene",), mcmc),
     "fox": ("times", 60, (), fox),
     "wreck": ("times", 60, (), wreck),
-    "mcmc": ("times", 90, ("scene",), mcmc),
-    "stages-3m": ("times", 50, (), lambda kit: stages(kit, "3m")),
     "gsplat-stages-1m": ("peers", 40, ("gsplat",), lambda kit: gsplat_stages(kit, "1m")),
     "gsplat-stages-3m": ("peers", 50, ("gsplat",), lambda kit: gsplat_stages(kit, "3m")),
     "vksplat-mcmc": ("peers", 90, ("scene", "vksplat"), lambda kit: peer_mcmc(kit, "vksplat")),
@@ -576,8 +615,28 @@ def chosen(words):
     return [name for name, (kind, *_) in PARTS.items() if not words or name in words or kind in words]
 
 
+def tidy_up(kit):
+    """Ends what still runs, and notes what was made."""
+    kit.sampler.ended.set()
+    for need, process in kit.background.items():
+        if isinstance(process, str):
+            continue
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+        elif process.returncode == 0:
+            (kit.work / f"{need}.made").touch()
+
+
+def stop_on_signals():
+    """SIGTERM ends it as Ctrl-C does, so that nothing goes on using the GPU."""
+    def stop(*_):
+        raise KeyboardInterrupt
+    signal.signal(signal.SIGTERM, stop)
+
+
 def run(words, out, limit, allow_cpu):
     out.mkdir(parents=True, exist_ok=True)
+    stop_on_signals()
     kit = Kit(out.resolve(), limit, allow_cpu)
     kit.events = kit.read("trace.json", {}).get("traceEvents", [])
     kit.say(f"Fathom {kit.settings['version']} ({kit.settings['commit']}) on {platform.node()}, {os.cpu_count()} CPUs")
@@ -589,32 +648,36 @@ def run(words, out, limit, allow_cpu):
     wanted = [name for name in chosen(words) if kit.parts.get(name, {}).get("result") != "ok"]
     # What failed before is tried again, but last.
     wanted.sort(key=lambda name: name in kit.parts)
-    prepare(kit, dict.fromkeys(need for name in wanted for need in PARTS[name][2]))
-    kit.sampler.start()
     left = []
-    for name in wanted:
-        kind, least, _, function = PARTS[name]
-        if kit.left() < least:
-            left.append(name)
-            continue
-        begin, kit.sampler.peak = kit.now(), 0.0
-        try:
-            function(kit)
-            result = {"result": "ok"}
-        except Failed as error:
-            result = {"result": "failed", "why": str(error)}
-        # A part goes wrong in its own ways; the others are worth their time all the same.
-        except Exception as error:  # pylint: disable=broad-exception-caught
-            result = {"result": "failed", "why": f"{type(error).__name__}: {error}"}
-        kit.parts[name] = {"kind": kind, "seconds": round(kit.now() - begin, 1), **result}
-        kit.say(f"{name}: {result['result']} in {kit.now() - begin:.1f} s {result.get('why', '')}")
-        kit.trace(name, begin, kit.now() - begin, 1)
-        (out / "parts.json").write_text(json.dumps(kit.parts, indent=1))
-        kit.write_trace()
-    kit.sampler.ended.set()
-    for process in kit.background.values():
-        if not isinstance(process, str) and process.poll() is None:
-            os.killpg(process.pid, signal.SIGTERM)
+    try:
+        prepare(kit, dict.fromkeys(need for name in wanted for need in PARTS[name][2]))
+        kit.sampler.start()
+        for name in wanted:
+            kind, least, _, function = PARTS[name]
+            if kit.left() < least:
+                left.append(name)
+                continue
+            begin, kit.sampler.peak = kit.now(), 0.0
+            try:
+                if name in WALL_TIMES:
+                    settle(kit)
+                function(kit)
+                result = {"result": "ok"}
+            except Failed as error:
+                result = {"result": "failed", "why": str(error)}
+            # A part goes wrong in its own ways; the others are worth their time all the same.
+            except Exception as error:  # pylint: disable=broad-exception-caught
+                result = {"result": "failed", "why": f"{type(error).__name__}: {error}"}
+            kit.parts[name] = {"kind": kind, "seconds": round(kit.now() - begin, 1), **result}
+            kit.say(f"{name}: {result['result']} in {kit.now() - begin:.1f} s {result.get('why', '')}")
+            kit.trace(name, begin, kit.now() - begin, 1)
+            (out / "parts.json").write_text(json.dumps(kit.parts, indent=1))
+            kit.write_trace()
+    except KeyboardInterrupt:
+        kit.say("run: stopped; the parts that are done have their results")
+        return 130
+    finally:
+        tidy_up(kit)
     if left:
         kit.say(f"no time was left for {', '.join(left)}; run this again")
     failed = [name for name in wanted if kit.parts.get(name, {}).get("result") == "failed"]

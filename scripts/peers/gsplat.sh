@@ -7,9 +7,9 @@
 #     scripts/peers/gsplat.sh run FOLDER ARGS...   run gsplat_bench.py with it
 #
 # pack takes the sources from GSPLAT_SOURCE (a checkout) or else clones them. The submodule glm comes from
-# the checkout, or from GLM_SOURCE if it is empty there. FUSED_SSIM_SOURCE (a checkout of
-# rahul-goel/fused-ssim, MIT) is optional: gsplat's own trainer needs it, and without it gsplat computes SSIM
-# by plain convolutions, which is slower. Python is python3, or what PYTHON names.
+# the checkout, or from GLM_SOURCE if it is empty there. fused-ssim (rahul-goel/fused-ssim, MIT), which
+# gsplat's own trainer needs, comes from FUSED_SSIM_SOURCE or is cloned. Without it gsplat computes SSIM by
+# plain convolutions, which is slower, and the results say so. Python is python3, or what PYTHON names.
 #
 # build and run exit with 3 if torch, nvcc or a CUDA GPU is missing, so that callers can distinguish "not
 # measured" from "wrong". GSPLAT_ARCH=9.0 builds for that architecture without looking for a GPU.
@@ -17,6 +17,7 @@ set -euo pipefail
 
 # Two commits after 1.6.0. It is a commit and no tag, so that everybody measures the same sources.
 commit=90d7b4b349e379ccf9ee6a8cef76aa40f48bb32e
+fused_ssim_commit=0ac916a05f48f8e477dc8ce1651a346b65ce2072
 glm_path=gsplat/cuda/csrc/third_party/glm
 python=${PYTHON:-python3}
 here=$(cd "$(dirname "$0")" && pwd)
@@ -52,12 +53,19 @@ pack() {
         gsplat setup.py config.yaml LICENSE) | tar -xf - -C "$folder/gsplat"
     (cd "$glm" && tar -cf - glm copying.txt) | tar -xf - -C "$folder/gsplat/$glm_path"
     commit_of "$source" >"$folder/gsplat/COMMIT"
-    if [ -n "${FUSED_SSIM_SOURCE:-}" ]; then
+    local fused=${FUSED_SSIM_SOURCE:-}
+    if [ -z "$fused" ] && git clone --quiet https://github.com/rahul-goel/fused-ssim "$scratch/fused-ssim"; then
+        git -C "$scratch/fused-ssim" checkout --quiet "$fused_ssim_commit"
+        fused=$scratch/fused-ssim
+    fi
+    if [ -n "$fused" ]; then
         mkdir -p "$folder/fused-ssim"
-        (cd "$FUSED_SSIM_SOURCE" && tar -cf - --exclude=__pycache__ \
+        (cd "$fused" && tar -cf - --exclude=__pycache__ \
             setup.py LICENSE ext.cpp ssim.cu ssim.h ssim3d.cu ssim3d.h fused_ssim) \
             | tar -xf - -C "$folder/fused-ssim"
-        commit_of "$FUSED_SSIM_SOURCE" >"$folder/fused-ssim/COMMIT"
+        commit_of "$fused" >"$folder/fused-ssim/COMMIT"
+    else
+        printf 'gsplat: fused-ssim cannot be cloned; SSIM will be plain convolutions\n' >&2
     fi
     du -sh "$folder"
 }

@@ -803,13 +803,13 @@ class Trainer:
     The pictures stay on the GPU, and the loss is not fetched in each step; both only make gsplat faster.
     """
 
-    def __init__(self, ops, scene, cap, points):
-        self.ops, self.scene = ops, scene
+    def __init__(self, ops, scene, cap, points, schedule_steps, sh_interval):
+        self.ops, self.scene, self.sh_interval = ops, scene, sh_interval
         self.params = initial_params(scene, points, ops.device)
         rates = RATES | {"means": RATES["means"] * scene.scale}
         self.optimizers = make_optimizers(self.params, rates)
         self.schedule = torch.optim.lr_scheduler.ExponentialLR(
-            self.optimizers["means"], gamma=0.01 ** (1.0 / MAX_STEPS)
+            self.optimizers["means"], gamma=0.01 ** (1.0 / schedule_steps)
         )
         self.strategy = ops.gsplat.MCMCStrategy(cap_max=cap)
         if ops.rehearsal:
@@ -834,7 +834,7 @@ class Trainer:
 
     def step(self, number):
         camera, pixels = self.next_view()
-        degree = min(number // SH_DEGREE_INTERVAL, SH_DEGREE)
+        degree = min(number // self.sh_interval, SH_DEGREE)
         picture, _ = render_params(self.ops, self.params, degree, camera)
         self.loss(picture, to_float(pixels)).backward()
         step_optimizers(self.optimizers)
@@ -907,7 +907,9 @@ def train_loop(trainer, clock, steps, seconds, tail):
 def train_verb(ops, clock, arguments):
     torch.manual_seed(SEED)
     scene = Scene(arguments.scene, arguments.max_resolution, ops.device)
-    trainer = Trainer(ops, scene, arguments.cap, arguments.points)
+    trainer = Trainer(
+        ops, scene, arguments.cap, arguments.points, arguments.schedule_steps, arguments.sh_interval
+    )
     first, psnr_first = len(trainer.params["means"]), trainer.psnr()
     clock.reset_peak()
     tail = min(500, arguments.steps)
@@ -923,6 +925,8 @@ def train_verb(ops, clock, arguments):
         "cap": arguments.cap,
         "steps": arguments.steps,
         "ssim": ssim_used(ops),
+        "schedule_steps": arguments.schedule_steps,
+        "sh_interval": arguments.sh_interval,
         "initial_gaussians": first,
         "initial_psnr": psnr_first,
         **result,
@@ -947,6 +951,10 @@ def parse():
     train.add_argument("--steps", type=int, default=3000)
     train.add_argument("--cap", type=int, default=1_000_000)
     train.add_argument("--seconds", type=float)
+    train.add_argument("--schedule-steps", type=int, default=MAX_STEPS, metavar="N",
+                       help="steps over which the learning rate falls")
+    train.add_argument("--sh-interval", type=int, default=SH_DEGREE_INTERVAL, metavar="N",
+                       help="steps between two degrees of the harmonics; 1: all at once")
     train.add_argument("--max-resolution", type=int, default=1600, metavar="PX", help="of the longer side")
     for verb in (stages, train):
         verb.add_argument("scene", type=Path)
