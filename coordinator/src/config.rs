@@ -20,6 +20,11 @@ pub struct CoordinatorConfig {
     /// Where to serve metrics and health over HTTP, neither encrypted nor authenticated; port 0 takes a free
     /// one. Default: nowhere.
     pub metrics_listen: Option<SocketAddr>,
+    /// Where to serve KEDA, which starts workers by the number of tasks; port 0 takes a free one. Beyond this
+    /// machine it needs `tls_cert`, `tls_key` and `scaler_client_ca`. Default: nowhere.
+    pub scaler_listen: Option<SocketAddr>,
+    /// Certificate authorities, PEM: KEDA must present a certificate signed by one of them. Default none.
+    pub scaler_client_ca: Option<PathBuf>,
     /// Lease duration: a task whose worker does not renew for this long is requeued, milliseconds. Workers
     /// renew every quarter of it. Default 60 000, at least 1000.
     pub lease_ms: u32,
@@ -85,6 +90,8 @@ impl Default for CoordinatorConfig {
             data_dir: PathBuf::from("fathom-data"),
             listen: SocketAddr::from((Ipv4Addr::LOCALHOST, 7420)),
             metrics_listen: None,
+            scaler_listen: None,
+            scaler_client_ca: None,
             lease_ms: 60_000,
             max_errors: 3,
             max_losses: 5,
@@ -123,6 +130,25 @@ impl CoordinatorConfig {
         require(
             self.metrics_listen.is_none_or(|listen| listen.port() == 0 || listen != self.listen),
             "metrics_listen must differ from listen",
+        );
+        let takes = |other: Option<SocketAddr>, listen: SocketAddr| {
+            other.is_some_and(|other| other.port() != 0 && other == listen)
+        };
+        require(
+            !takes(self.scaler_listen, self.listen)
+                && !self.metrics_listen.is_some_and(|metrics| takes(self.scaler_listen, metrics)),
+            "scaler_listen must differ from listen and metrics_listen",
+        );
+        require(
+            self.scaler_client_ca.is_none() || (self.tls_cert.is_some() && self.scaler_listen.is_some()),
+            "scaler_client_ca needs scaler_listen, tls_cert and tls_key: certificates are sent over TLS only",
+        );
+        require(
+            self.scaler_client_ca.is_some()
+                || self.insecure
+                || self.scaler_listen.is_none_or(|listen| listen.ip().is_loopback()),
+            "scaler_listen is reachable from other machines, and anyone could read how many tasks there are: set tls_cert, \
+             tls_key and scaler_client_ca, or insecure = true",
         );
         require(self.lease_ms >= 1000, "lease_ms must be at least 1000: workers renew every quarter of it");
         require(self.lease_ms <= 86_400_000, "lease_ms must be at most a day");
@@ -226,6 +252,27 @@ mod tests {
         });
         assert_eq!(said, Vec::<String>::new());
         assert_eq!(faults(|config| (config.listen, config.insecure) = (everywhere, true)).len(), 0);
+    }
+
+    #[test]
+    fn a_scaler_beyond_the_machine_needs_certificates() {
+        let everywhere = Some(SocketAddr::from((Ipv4Addr::UNSPECIFIED, 7430)));
+        let pem = || Some(PathBuf::from("a.pem"));
+        let said = faults(|config| config.scaler_listen = everywhere);
+        assert!(said.len() == 1 && said[0].contains("scaler_client_ca"), "{said:?}");
+        assert_eq!(
+            faults(|config| config.scaler_listen = Some(SocketAddr::from(([127, 0, 0, 1], 7430)))).len(),
+            0
+        );
+        let said = faults(|config| {
+            config.scaler_listen = everywhere;
+            (config.tls_cert, config.tls_key, config.scaler_client_ca) = (pem(), pem(), pem());
+        });
+        assert_eq!(said, Vec::<String>::new());
+        let said = faults(|config| config.scaler_client_ca = pem());
+        assert!(said.len() == 1 && said[0].contains("needs scaler_listen"), "{said:?}");
+        let said = faults(|config| config.scaler_listen = Some(config.listen));
+        assert!(said.len() == 1 && said[0].contains("must differ"), "{said:?}");
     }
 
     #[test]

@@ -23,6 +23,7 @@ mod own_tasks;
 mod rate_limited_log;
 mod references;
 pub mod retention;
+mod scaler;
 pub mod schedule;
 mod server;
 mod service_error;

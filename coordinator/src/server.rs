@@ -37,6 +37,7 @@ use crate::objects::{Removed, TenantBlobs};
 use crate::own_tasks::run_own_tasks;
 use crate::rate_limited_log::RateLimitedLog;
 use crate::retention::{Housekeeping, Policy, RetentionError, collect, collect_garbage};
+use crate::scaler;
 use crate::services::{Admin, Jobs, Uploads, Workers, logs, release_disowned};
 use crate::state::{State, stopped};
 use crate::store::{SledOptions, SledStore, Store};
@@ -63,6 +64,7 @@ pub struct Coordinator {
     address: SocketAddr,
     scheme: &'static str,
     metrics_address: Option<SocketAddr>,
+    scaler_address: Option<SocketAddr>,
     stopping: watch::Sender<bool>,
     running: JoinHandle<Result<(), CoordinatorError>>,
     shared: Arc<State>,
@@ -82,6 +84,11 @@ impl Coordinator {
     /// The address of metrics and health, if served.
     pub fn metrics_address(&self) -> Option<SocketAddr> {
         self.metrics_address
+    }
+
+    /// The address of the scaler, if served.
+    pub fn scaler_address(&self) -> Option<SocketAddr> {
+        self.scaler_address
     }
 
     /// Collects garbage now by a policy, and returns what was removed. This also runs once an hour by the
@@ -145,6 +152,10 @@ pub async fn serve(config: CoordinatorConfig) -> Result<Coordinator, Coordinator
         Some(address) => Some(listen(address).await?),
         None => None,
     };
+    let for_scaler = match config.scaler_listen {
+        Some(address) => Some((listen(address).await?, Tls::of_scaler(&config)?)),
+        None => None,
+    };
     let clock = Clock::start();
     data_dir::make(&config.data_dir)?;
     let objects = TenantBlobs::open(&config.data_dir, config.min_free_bytes, clock)?;
@@ -159,7 +170,14 @@ pub async fn serve(config: CoordinatorConfig) -> Result<Coordinator, Coordinator
         .map_err(|e| CoordinatorError::Server(e.to_string()))??;
     let house = config.housekeeping();
     let room = Room::of_this_process();
-    start(config, tls, objects, store, clock, house, for_metrics, room, accepted(listener)).await
+    let mut coordinator =
+        start(config, tls, objects, store, clock, house, for_metrics, room, accepted(listener)).await?;
+    if let Some(((listener, address), tls)) = for_scaler {
+        tracing::info!(%address, with_certificates = tls.is_some(), "serving KEDA");
+        coordinator.scaler_address = Some(address);
+        tokio::spawn(scaler::serve(Arc::clone(&coordinator.shared), listener, tls));
+    }
+    Ok(coordinator)
 }
 
 /// Starts a coordinator on a given store, clock and connections, with given settings of garbage collection,
@@ -300,7 +318,7 @@ where
             tokio::spawn(run(Arc::clone(&shared), house.every, tls.over(incoming), guard))
         }
     };
-    Ok(Coordinator { address, metrics_address, scheme, stopping, running, shared })
+    Ok(Coordinator { address, metrics_address, scaler_address: None, scheme, stopping, running, shared })
 }
 
 async fn listen(listen: SocketAddr) -> Result<(TcpListener, SocketAddr), CoordinatorError> {

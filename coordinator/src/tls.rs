@@ -49,8 +49,21 @@ impl Tls {
     /// # Errors
     /// When a file cannot be read, or lacks its content.
     pub fn read(config: &CoordinatorConfig) -> Result<Option<Arc<Self>>, CoordinatorError> {
+        Self::of(config, Clients { ca: config.client_ca.clone(), all_present_certificates: false })
+    }
+
+    /// The TLS of the scaler's address, where every client must present a certificate; `None` for plain text.
+    ///
+    /// # Errors
+    /// As [`Self::read`].
+    pub fn of_scaler(config: &CoordinatorConfig) -> Result<Option<Arc<Self>>, CoordinatorError> {
+        let Some(ca) = config.scaler_client_ca.clone() else { return Ok(None) };
+        Self::of(config, Clients { ca: Some(ca), all_present_certificates: true })
+    }
+
+    fn of(config: &CoordinatorConfig, clients: Clients) -> Result<Option<Arc<Self>>, CoordinatorError> {
         let (Some(cert), Some(key)) = (&config.tls_cert, &config.tls_key) else { return Ok(None) };
-        let files = Files { cert: cert.clone(), key: key.clone(), client_ca: config.client_ca.clone() };
+        let files = Files { cert: cert.clone(), key: key.clone(), clients };
         let first = files.read().map_err(CoordinatorError::Config)?;
         let in_use = RwLock::new(first.server_config().map_err(CoordinatorError::Config)?);
         Ok(Some(Arc::new(Self { files, first, in_use, failed: RateLimitedLog::default() })))
@@ -126,7 +139,14 @@ impl Tls {
 struct Files {
     cert: PathBuf,
     key: PathBuf,
-    client_ca: Option<PathBuf>,
+    clients: Clients,
+}
+
+/// Whose certificates count.
+struct Clients {
+    ca: Option<PathBuf>,
+    /// Whether a client without a certificate is refused in the handshake.
+    all_present_certificates: bool,
 }
 
 /// Content of the files.
@@ -135,6 +155,7 @@ struct Pems {
     cert: String,
     key: String,
     client_ca: Option<String>,
+    all_present_certificates: bool,
 }
 
 impl Files {
@@ -142,14 +163,15 @@ impl Files {
         Ok(Pems {
             cert: read_pem(&self.cert, "CERTIFICATE")?,
             key: read_pem(&self.key, "PRIVATE KEY")?,
-            client_ca: self.client_ca.as_deref().map(|path| read_pem(path, "CERTIFICATE")).transpose()?,
+            client_ca: self.clients.ca.as_deref().map(|path| read_pem(path, "CERTIFICATE")).transpose()?,
+            all_present_certificates: self.clients.all_present_certificates,
         })
     }
 
     /// Rereads regular files only: a shell's pipe (`--tls-key <(...)`) can be read only once.
     fn read_again(&self, before: Option<&Pems>) -> Result<Pems, String> {
         let is_pipe = |path: &Path| path.metadata().is_ok_and(|found| !found.is_file());
-        let mut paths = [Some(&self.cert), Some(&self.key), self.client_ca.as_ref()].into_iter().flatten();
+        let mut paths = [Some(&self.cert), Some(&self.key), self.clients.ca.as_ref()].into_iter().flatten();
         match before {
             Some(before) if paths.any(|path| is_pipe(path)) => Ok(before.clone()),
             _ => self.read(),
@@ -188,8 +210,11 @@ impl Pems {
                 roots.add_parsable_certificates(certificates(authorities)?);
                 let verifier = WebPkiClientVerifier::builder_with_provider(roots.into(), provider);
                 // Users authenticate with tokens; the guard requires the certificates of workers.
-                let verifier = verifier.allow_unauthenticated().build().map_err(|error| wrong(&error))?;
-                builder.with_client_cert_verifier(verifier)
+                let verifier = match self.all_present_certificates {
+                    true => verifier,
+                    false => verifier.allow_unauthenticated(),
+                };
+                builder.with_client_cert_verifier(verifier.build().map_err(|error| wrong(&error))?)
             }
         };
         let config = builder.with_single_cert(certificates(&self.cert)?, key);
@@ -225,7 +250,13 @@ mod tests {
     use super::*;
 
     fn pems(text: &str) -> Result<Pems, String> {
-        Ok(Pems { cert: text.to_owned(), key: String::new(), client_ca: None })
+        let none = Pems {
+            cert: text.to_owned(),
+            key: String::new(),
+            client_ca: None,
+            all_present_certificates: false,
+        };
+        Ok(none)
     }
 
     #[test]

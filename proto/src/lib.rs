@@ -42,6 +42,11 @@ pub mod worker {
     }
 }
 
+/// KEDA's interface of external scalers.
+pub mod keda {
+    tonic::include_proto!("externalscaler");
+}
+
 /// All messages and services as an encoded `FileDescriptorSet`, for reflection and compatibility tests.
 pub const FILE_DESCRIPTOR_SET: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/descriptors.bin"));
 

@@ -12,6 +12,7 @@ mod datasets;
 mod hostile;
 mod jobs;
 mod leaving;
+mod scaler;
 mod session;
 mod several_gpus;
 mod stages;

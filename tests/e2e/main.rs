@@ -15,6 +15,8 @@ mod held_out;
 mod hostile;
 #[cfg(unix)]
 mod logs;
+#[cfg(unix)]
+mod on_demand;
 #[path = "../support/processes.rs"]
 mod processes;
 mod render;

@@ -90,6 +90,11 @@ impl TestCluster {
         UploadServiceClient::new(self.channel.clone())
     }
 
+    /// Where the coordinator serves KEDA.
+    pub fn scaler_address(&self) -> SocketAddr {
+        self.coordinator.as_ref().unwrap().scaler_address().unwrap()
+    }
+
     /// A response of the coordinator over HTTP.
     pub async fn page(&self, path: &str) -> (u16, String) {
         page(self.coordinator.as_ref().unwrap().metrics_address().unwrap(), path).await
@@ -265,13 +270,21 @@ impl TestCluster {
         gpus: Vec<OnGpu>,
         metrics_listen: Option<SocketAddr>,
     ) -> RunningWorker {
-        let config = WorkerConfig {
-            metrics_listen,
+        let settings = WorkerConfig { metrics_listen, ..self.worker_settings(url, name) };
+        Self::start_worker(settings, gpus)
+    }
+
+    /// Settings of a worker with its cache beside the coordinator's data.
+    pub fn worker_settings(&self, url: &str, name: &str) -> WorkerConfig {
+        WorkerConfig {
             coordinator: Dial::to(url),
             name: name.into(),
             cache_dir: self.dir.path().join("cache"),
             ..WorkerConfig::default()
-        };
+        }
+    }
+
+    pub fn start_worker(config: WorkerConfig, gpus: Vec<OnGpu>) -> RunningWorker {
         let (stop, stopping) = watch::channel(false);
         RunningWorker { stop, running: tokio::spawn(run_on(config, gpus, stopping)) }
     }
@@ -307,6 +320,10 @@ impl RunningWorker {
 
     pub fn ask_to_leave(&self) {
         self.stop.send_replace(true);
+    }
+
+    pub fn has_ended(&self) -> bool {
+        self.running.is_finished()
     }
 
     pub async fn ended(self) -> Result<(), WorkerError> {

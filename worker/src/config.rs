@@ -1,10 +1,15 @@
 //! Settings of a worker.
 
+use std::fmt;
 use std::net::SocketAddr;
+use std::num::NonZeroU32;
 use std::path::PathBuf;
+use std::str::FromStr;
+use std::time::Duration;
 
 use fathom_proto::dial::Dial;
-use serde::{Deserialize, Serialize};
+use serde::de::Error as _;
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use tracing::level_filters::LevelFilter;
 
 use crate::gpus::Gpus;
@@ -40,6 +45,47 @@ pub struct WorkerConfig {
     pub allow_cpu: bool,
     /// Memory limit of each GPU, bytes; also reported to the coordinator. Default: all of it.
     pub gpu_memory_limit: Option<u64>,
+    /// The worker ends after this long without a task; each GPU counts for itself. Default: never.
+    pub exit_when_idle: Option<IdleLimit>,
+    /// Tasks of each GPU after which it takes no more; the worker ends with the last of them. A task that was
+    /// returned or failed counts too. Default: no limit.
+    pub max_tasks: Option<NonZeroU32>,
+}
+
+/// A time of at least a second, written like `120s`, `5m` or `1h 30m`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct IdleLimit(pub Duration);
+
+impl FromStr for IdleLimit {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let limit = humantime::parse_duration(text)
+            .map_err(|error| format!("{error}; write a time like 120s, 5m or 1h"))?;
+        if limit < Duration::from_secs(1) {
+            return Err("use at least 1s: a worker asks for a task before it is idle".to_owned());
+        }
+        Ok(Self(limit))
+    }
+}
+
+impl fmt::Display for IdleLimit {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        humantime::format_duration(self.0).fmt(f)
+    }
+}
+
+impl Serialize for IdleLimit {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.collect_str(self)
+    }
+}
+
+impl<'de> Deserialize<'de> for IdleLimit {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        let text = String::deserialize(deserializer)?;
+        text.parse().map_err(|error| D::Error::custom(format!("exit_when_idle: {error}")))
+    }
 }
 
 impl Default for WorkerConfig {
@@ -55,6 +101,8 @@ impl Default for WorkerConfig {
             gpus: Gpus::default(),
             allow_cpu: false,
             gpu_memory_limit: None,
+            exit_when_idle: None,
+            max_tasks: None,
         }
     }
 }

@@ -32,7 +32,7 @@ use tokio::net::TcpListener;
 use tokio::sync::watch;
 use tokio::task::JoinSet;
 
-pub use config::WorkerConfig;
+pub use config::{IdleLimit, WorkerConfig};
 pub use error::WorkerError;
 pub use gpus::{Gpus, OnGpu};
 pub use views::PhotographSource;

@@ -1,5 +1,6 @@
 //! The main loop of a worker: register, claim, fetch, execute, submit, repeat.
 
+use std::num::NonZeroU32;
 use std::sync::Arc;
 use std::sync::atomic::AtomicU32;
 use std::time::Duration;
@@ -40,6 +41,8 @@ const LEAVE_WITHIN: Duration = Duration::from_secs(20);
 const ANSWERED_WITHIN: Duration = Duration::from_secs(5);
 /// Reason that a leaving worker reports when it returns a task.
 const ASKED_TO_LEAVE: &str = "the worker was asked to leave";
+/// The same of one that was idle for too long.
+const IDLE: &str = "the worker was idle for too long, and leaves";
 /// Log a warning at this interval while a training thread ignores a stop request.
 const WARN_EVERY: Duration = Duration::from_secs(5);
 
@@ -52,6 +55,9 @@ pub struct Session {
     executor: Arc<dyn Executor>,
     registration: v1::RegisterRequest,
     pulse: Arc<Pulse>,
+    /// The session ends after this long without a task, or after so many of them.
+    exit_when_idle: Option<Duration>,
+    max_tasks: Option<NonZeroU32>,
     /// Held by the training thread from start to end, so there is never a second one.
     seat: Arc<tokio::sync::Mutex<()>>,
     stopping: watch::Receiver<bool>,
@@ -98,24 +104,35 @@ impl Session {
             executor,
             registration,
             pulse,
+            exit_when_idle: config.exit_when_idle.map(|limit| limit.0),
+            max_tasks: config.max_tasks,
             seat: Arc::default(),
             stopping,
             _heartbeat: heartbeat,
         })
     }
 
-    /// Works until asked to stop.
+    /// Works until asked to stop, until it was idle for too long, or until it has done all its tasks.
     pub async fn run(self) -> Result<(), WorkerError> {
         let mut stopping = self.stopping.clone();
-        self.until_stopped(&mut stopping, self.register_first()).await.transpose()?;
+        let (mut tasks, mut idle_since) = (0, Instant::now());
+        if self.unless_idle(&mut stopping, idle_since, self.register_first()).await.transpose()?.is_none() {
+            return Ok(());
+        }
         // A worker asked to stop during a task claims no further one: it would only have to return it.
         while !*stopping.borrow() {
-            if self.until_stopped(&mut stopping, self.prepared()).await.transpose()?.is_none() {
+            if self.max_tasks.is_some_and(|most| tasks >= most.get()) {
+                tracing::info!(tasks, "leaving: as many tasks as this worker was to take");
+                break;
+            }
+            if self.unless_idle(&mut stopping, idle_since, self.prepared()).await.transpose()?.is_none() {
                 break;
             }
             let request_id = Uuid::new_v4().to_string();
-            let Some(claimed) = self.until_stopped(&mut stopping, self.claim(&request_id)).await else {
-                self.give_back_unheard(request_id).await;
+            let claim = self.claim(&request_id, self.idle_time_left(idle_since));
+            let Some(claimed) = self.unless_idle(&mut stopping, idle_since, claim).await else {
+                let why = if *stopping.borrow() { ASKED_TO_LEAVE } else { IDLE };
+                self.give_back_unheard(request_id, why).await;
                 break;
             };
             let Some(assignment) = claimed? else { continue };
@@ -126,9 +143,38 @@ impl Session {
             let span = attempt_span(&lease.job_id, &lease.task_id, lease.attempt, name);
             capture::attach(&span, self.logs.sink(lease.clone()));
             self.work(lease, assignment).instrument(span).await?;
+            (tasks, idle_since) = (tasks + 1, Instant::now());
         }
         self.logs.finish().await;
         Ok(())
+    }
+
+    /// Time until this worker has been idle for too long.
+    fn idle_time_left(&self, idle_since: Instant) -> Duration {
+        self.exit_when_idle.map_or(Duration::MAX, |limit| limit.saturating_sub(idle_since.elapsed()))
+    }
+
+    /// The result of `work`, or `None` once the worker must leave or has been idle for too long. It may
+    /// finish what it waits for a little later: the answer to a claim comes at the end of the idle time.
+    async fn unless_idle<T>(
+        &self,
+        stopping: &mut watch::Receiver<bool>,
+        idle_since: Instant,
+        work: impl Future<Output = T>,
+    ) -> Option<T> {
+        let left = self.idle_time_left(idle_since);
+        if !left.is_zero() {
+            let limit = left.saturating_add(CLAIM_GRACE);
+            match self.until_stopped(stopping, tokio::time::timeout(limit, work)).await {
+                Some(Ok(result)) => return Some(result),
+                None => return None,
+                Some(Err(_)) => {}
+            }
+        }
+        let seconds = self.exit_when_idle.unwrap_or_default().as_secs();
+        let reason = self.blobs.trouble().latest();
+        tracing::info!(seconds, trouble = reason.as_deref(), "leaving: there was no task for this long");
+        None
     }
 
     /// The result of `work`, or `None` once the worker must leave.
@@ -194,12 +240,14 @@ impl Session {
         }
     }
 
-    /// Claims a task once. After a lost answer it repeats the claim with the same id, so no lease is lost.
-    async fn claim(&self, request_id: &str) -> Result<Option<v1::Assignment>, WorkerError> {
+    /// Claims a task once, and waits for one at most `within`. After a lost answer it repeats the claim with
+    /// the same id, so no lease is lost.
+    async fn claim(&self, request_id: &str, within: Duration) -> Result<Option<v1::Assignment>, WorkerError> {
+        let wait_ms = u32::try_from(within.as_millis()).map_or(CLAIM_WAIT_MS, |left| left.min(CLAIM_WAIT_MS));
         let request = v1::ClaimRequest {
             incarnation: self.registration.incarnation.clone(),
             request_id: request_id.to_owned(),
-            wait_ms: CLAIM_WAIT_MS,
+            wait_ms,
         };
         let limit = Duration::from_millis(CLAIM_WAIT_MS.into()) + CLAIM_GRACE;
         loop {
@@ -221,10 +269,10 @@ impl Session {
         }
     }
 
-    /// Returns the task of a claim that was unanswered when the worker was asked to leave. Otherwise its
+    /// Returns the task of a claim that was unanswered when the worker was to leave. Otherwise its
     /// lease would expire and count as a lost worker. Tries once, because an unreachable coordinator must not
     /// keep a worker from leaving.
-    async fn give_back_unheard(&self, request_id: String) {
+    async fn give_back_unheard(&self, request_id: String, why: &str) {
         let incarnation = self.registration.incarnation.clone();
         let request = v1::ClaimRequest { incarnation, request_id, wait_ms: 0 };
         let mut client = self.client.clone();
@@ -233,7 +281,7 @@ impl Session {
                 let Some(lease) = answer.into_inner().assignment.and_then(|given| given.lease) else {
                     return;
                 };
-                self.try_to_give_back(&lease, None, ASKED_TO_LEAVE).await;
+                self.try_to_give_back(&lease, None, why).await;
             }
             Ok(Err(status)) => {
                 tracing::debug!(reason = %status.message(), "the answer to the last claim is unknown");

@@ -44,6 +44,14 @@ pub struct CoordinatorSettings {
     /// authentication [default: nowhere]
     #[arg(long, value_name = "ADDRESS:PORT", env = "FATHOM_METRICS_LISTEN", value_parser = super::parse_address)]
     metrics_listen: Option<SocketAddr>,
+    /// Address that tells KEDA how many workers to start; beyond this machine it needs --tls-cert, --tls-key
+    /// and --scaler-client-ca [default: nowhere]
+    #[arg(long, value_name = "ADDRESS:PORT", env = "FATHOM_SCALER_LISTEN", value_parser = super::parse_address)]
+    scaler_listen: Option<SocketAddr>,
+    /// CA certificates, PEM, read again when the file changes; KEDA must show a certificate that one of them
+    /// signed [default: none]
+    #[arg(long, value_name = "FILE", env = "FATHOM_SCALER_CLIENT_CA")]
+    scaler_client_ca: Option<PathBuf>,
     /// Silence of a worker after which another worker gets its task, milliseconds, 1000 to a day
     #[arg(long, value_name = "MS", env = "FATHOM_LEASE_MS")]
     lease_ms: Option<u32>,

@@ -1,13 +1,14 @@
 //! `fathom worker`: connects to a coordinator, takes tasks, trains, and submits the results.
 
 use std::net::SocketAddr;
+use std::num::NonZeroU32;
 use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::Args;
 use fathom_proto::dial::Dial;
 use fathom_worker::gpus::{self, GpuName};
-use fathom_worker::{WorkerConfig, WorkerError, run_on};
+use fathom_worker::{IdleLimit, WorkerConfig, WorkerError, run_on};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use tokio::sync::watch;
@@ -88,6 +89,12 @@ pub struct WorkerSettings {
     #[arg(long, value_name = "LEVEL", env = "FATHOM_JOB_LOG_LEVEL")]
     #[arg(value_parser = ["off", "error", "warn", "info", "debug"])]
     job_log_level: Option<String>,
+    /// End after this long without a task, such as 120s or 5m; each GPU counts for itself [default: never]
+    #[arg(long, value_name = "TIME", env = "FATHOM_EXIT_WHEN_IDLE")]
+    exit_when_idle: Option<IdleLimit>,
+    /// End after so many tasks of each GPU [default: no limit]
+    #[arg(long, value_name = "N", env = "FATHOM_MAX_TASKS")]
+    max_tasks: Option<NonZeroU32>,
 }
 
 /// The resolved settings of a worker.
@@ -226,6 +233,8 @@ mod tests {
             ("gpu_memory_limit = 5", "--gpu-memory-limit=5", "--gpu-memory-limit=6"),
             ("job_log_level = 'warn'", "--job-log-level=warn", "--job-log-level=off"),
             ("gpu = 3", "--gpu=3", "--gpu=4"),
+            ("exit_when_idle = '2m'", "--exit-when-idle=120s", "--exit-when-idle=1h"),
+            ("max_tasks = 7", "--max-tasks=7", "--max-tasks=8"),
             (
                 "coordinator = 'http://127.0.0.1:1'",
                 "--coordinator=http://127.0.0.1:1",
@@ -260,6 +269,8 @@ mod tests {
             ("gpu = -1", "for gpu use a number, several in brackets, or \"all\""),
             ("gpu = [0, 'all']", "the GPUs 0, all: use either numbers or all"),
             ("gpus = 1", "unknown key `gpus`"),
+            ("exit_when_idle = '1 minuet'", "exit_when_idle: unknown time unit \"minuet\""),
+            ("exit_when_idle = '10ms'", "exit_when_idle: use at least 1s"),
             ("job_log_level = 'loud'", "job_log_level: use off, error, warn, info or debug"),
         ] {
             let error = read(text).unwrap_err();

@@ -182,8 +182,13 @@ pub struct Visit(Arc<State>);
 impl Visit {
     /// The visit of a request.
     pub fn of<B>(request: &http::Request<B>) -> Option<&Self> {
-        let over_tls = request.extensions().get::<TlsConnectInfo<Self>>().map(TlsConnectInfo::get_ref);
-        over_tls.or_else(|| request.extensions().get::<Self>())
+        Self::in_extensions(request.extensions())
+    }
+
+    /// The visit in what a request carries.
+    pub fn in_extensions(carried: &http::Extensions) -> Option<&Self> {
+        let over_tls = carried.get::<TlsConnectInfo<Self>>().map(TlsConnectInfo::get_ref);
+        over_tls.or_else(|| carried.get::<Self>())
     }
 
     /// Its remote address.

@@ -11,8 +11,8 @@ use crate::schedule::{
     Renewed, Stage, TaskId, TaskRecord,
 };
 use crate::store::{
-    Claim, Grant, JobFilter, JobStore, JobView, Levels, NewJob, ReadyTask, Store, StoreError, StoredEvent,
-    WorkerMark,
+    Claim, Grant, JobFilter, JobStore, JobView, Levels, NewJob, OpenWork, ReadyTask, Store, StoreError,
+    StoredEvent, WorkerMark,
 };
 
 /// Another store, counted.
@@ -195,6 +195,10 @@ impl JobStore for CountedStore {
 
     async fn ready(&self) -> Result<Vec<ReadyTask>, StoreError> {
         self.store.ready().await
+    }
+
+    async fn open_work(&self) -> Result<Vec<OpenWork>, StoreError> {
+        self.store.open_work().await
     }
 
     async fn leased(&self) -> Result<Vec<(Lease, Attempt)>, StoreError> {

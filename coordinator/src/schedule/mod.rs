@@ -28,7 +28,7 @@ pub use fit::{Requirements, Shortfall, WorkerProfile};
 pub use ids::{JobId, ParseIdError, TaskId};
 pub use job::{JobRecord, JobShape, JobState};
 pub use leases::{LeaseTable, LiveProgress, Renewed};
-pub use queue::{Next, Queue, ReadyTask, Usage};
+pub use queue::{Next, OpenWork, Queue, ReadyTask, Usage};
 pub use rows::{JobRows, Rules};
 pub use scheduler::{RowsNeeded, rows_needed, step};
 pub use stages::{Artifact, RunsOn, STAGES, Stage, StageSpec};

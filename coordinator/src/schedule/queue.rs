@@ -56,6 +56,8 @@ struct OpenJob {
 struct Leased {
     /// The calls that got its leases: one or two.
     calls: Vec<Call>,
+    /// Its requirements on a worker.
+    need: Requirements,
     /// Data for a second attempt; `None` if none is allowed.
     alone: Option<Alone>,
 }
@@ -63,7 +65,6 @@ struct Leased {
 /// A task with one attempt that may get a second one.
 #[derive(Debug)]
 struct Alone {
-    need: Requirements,
     failed_on: Vec<String>,
     since_ms: u64,
     /// Iterations that its worker has to do.
@@ -92,6 +93,19 @@ pub struct ReadyTask {
     pub need: Requirements,
     /// Earliest time to take it, Unix milliseconds.
     pub not_before_ms: u64,
+}
+
+/// The tasks of a running job, for those who start workers.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct OpenWork {
+    /// Its tenant.
+    pub tenant: Tenant,
+    /// See [`JobRecord::max_parallel`].
+    pub max_parallel: u32,
+    /// Waiting tasks, each with the earliest time to take it, Unix milliseconds.
+    pub waiting: Vec<(Requirements, u64)>,
+    /// Tasks that are leased, once for each of their leases.
+    pub leased: Vec<Requirements>,
 }
 
 #[derive(Debug)]
@@ -164,13 +178,12 @@ impl Queue {
                         self.given.insert(call.clone(), (job.job_id.clone(), record.task));
                     }
                     let alone = record.may_have_second_attempt().then(|| Alone {
-                        need: record.need(),
                         failed_on: record.failed_on.clone(),
                         since_ms: first.since_ms,
                         iterations: record.iterations_of(first),
                     });
                     known.leases += calls.len() as u32;
-                    known.leased.insert(record.task, Leased { calls, alone });
+                    known.leased.insert(record.task, Leased { calls, need: record.need(), alone });
                 }
                 _ => {}
             }
@@ -222,7 +235,7 @@ impl Queue {
             self.in_turn(worker, has_slow, &quota_of).into_iter().find_map(|(id, job)| {
                 let may_go = |leased: &Leased, alone: &Alone| {
                     leased.calls.iter().all(|call| call.incarnation != worker.incarnation)
-                        && may_take(&job.tenant, alone.need, &alone.failed_on, worker, peers)
+                        && may_take(&job.tenant, leased.need, &alone.failed_on, worker, peers)
                 };
                 let (task, ..) = job.slow(now_ms, rules).find(|(_, leased, alone)| may_go(leased, alone))?;
                 Some(Next { job: id.clone(), task, is_second: true })
@@ -265,6 +278,18 @@ impl Queue {
             not_before_ms: waiting.not_before_ms,
         });
         ready.collect()
+    }
+
+    /// The tasks of each running job.
+    pub fn open_work(&self) -> Vec<OpenWork> {
+        let running = self.jobs.values().filter(|job| job.runs);
+        let work = running.map(|job| OpenWork {
+            tenant: job.tenant.clone(),
+            max_parallel: job.max_parallel,
+            waiting: job.ready.values().map(|waiting| (waiting.need, waiting.not_before_ms)).collect(),
+            leased: job.leased.values().flat_map(|leased| leased.calls.iter().map(|_| leased.need)).collect(),
+        });
+        work.collect()
     }
 
     /// Tasks that are leased, each once.

@@ -8,8 +8,8 @@ use tonic::async_trait;
 
 use super::export::{Export, JobExport};
 use super::{
-    AccessStore, Claim, DatasetStore, Grant, JobFilter, JobStore, JobView, Levels, NewJob, ReadyTask, Store,
-    StoreError, StoredEvent, WorkerMark, check_new_dataset, request_key,
+    AccessStore, Claim, DatasetStore, Grant, JobFilter, JobStore, JobView, Levels, NewJob, OpenWork,
+    ReadyTask, Store, StoreError, StoredEvent, WorkerMark, check_new_dataset, request_key,
 };
 use crate::access::TokenRecord;
 use crate::datasets::{DatasetId, DatasetRecord, NewDataset};
@@ -326,6 +326,24 @@ impl JobStore for MemoryStore {
             _ => None,
         });
         Ok(ready.collect())
+    }
+
+    async fn open_work(&self) -> Result<Vec<OpenWork>, StoreError> {
+        let state = self.lock();
+        let running = state.jobs.values().filter(|rows| rows.job.state == JobState::Running);
+        let work = running.map(|rows| {
+            let waits = |task: &TaskRecord| match task.state {
+                TaskState::Ready { not_before_ms } => Some((task.need(), not_before_ms)),
+                _ => None,
+            };
+            OpenWork {
+                tenant: rows.job.tenant.clone(),
+                max_parallel: rows.job.max_parallel,
+                waiting: rows.tasks.values().filter_map(waits).collect(),
+                leased: rows.tasks.values().flat_map(|task| task.running().map(|_| task.need())).collect(),
+            }
+        });
+        Ok(work.collect())
     }
 
     async fn leased(&self) -> Result<Vec<(Lease, Attempt)>, StoreError> {

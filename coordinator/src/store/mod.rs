@@ -28,12 +28,12 @@ pub(crate) use self::sled::sync_folder;
 pub use self::sled::{SledOptions, SledStore};
 use crate::access::TokenRecord;
 use crate::datasets::{DatasetId, DatasetRecord, MAX_DATASETS, NewDataset};
-pub use crate::schedule::ReadyTask;
 use crate::schedule::{
     Attempt, Event, EventBody, Expired, FailClass, JobId, JobRecord, JobShape, JobState, Lease, LiveProgress,
     Outcome, Quota, Refusal, Renewed, Stage, TaskId, TaskOutput, TaskRecord, TaskState, Tenant, Usage,
     WorkerProfile,
 };
+pub use crate::schedule::{OpenWork, ReadyTask};
 
 /// Version of this program.
 const PROGRAM: &str = env!("CARGO_PKG_VERSION");
@@ -467,6 +467,8 @@ pub trait JobStore: Send + Sync {
     async fn progress(&self, job: &JobId) -> Result<(Vec<(TaskId, LiveProgress)>, f64), StoreError>;
     /// Waiting tasks of running jobs, including those in back-off.
     async fn ready(&self) -> Result<Vec<ReadyTask>, StoreError>;
+    /// The tasks of each running job.
+    async fn open_work(&self) -> Result<Vec<OpenWork>, StoreError>;
     /// All leases that are held, each with its attempt.
     async fn leased(&self) -> Result<Vec<(Lease, Attempt)>, StoreError>;
     /// The gauges, by a query whose cost does not grow with ended jobs.

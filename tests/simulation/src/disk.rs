@@ -18,7 +18,7 @@ use fathom_coordinator::schedule::{
 use fathom_coordinator::store::export::{Export, JobExport};
 use fathom_coordinator::store::{
     AccessStore, Claim, DatasetStore, Grant, JobFilter, JobStore, JobView, Levels, MemoryStore, NewJob,
-    ReadyTask, Store, StoreError, StoredEvent, WorkerMark,
+    OpenWork, ReadyTask, Store, StoreError, StoredEvent, WorkerMark,
 };
 use fathom_core::scene::BlobRef;
 use tonic::async_trait;
@@ -431,6 +431,10 @@ impl JobStore for DiskStore {
 
     async fn ready(&self) -> Result<Vec<ReadyTask>, StoreError> {
         self.look(self.memory.ready()).await
+    }
+
+    async fn open_work(&self) -> Result<Vec<OpenWork>, StoreError> {
+        self.look(self.memory.open_work()).await
     }
 
     async fn leased(&self) -> Result<Vec<(Lease, Attempt)>, StoreError> {

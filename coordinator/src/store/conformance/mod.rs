@@ -443,4 +443,5 @@ conformance!(
     one_of_two_attempts_may_fail_and_nothing_is_counted,
     a_second_worker_that_fails_leaves_the_task_to_the_first,
     a_paused_or_ended_job_ends_both_workers_at_a_task,
+    open_work_has_the_waiting_and_leased_tasks_of_running_jobs,
 );

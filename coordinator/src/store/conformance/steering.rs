@@ -1,6 +1,7 @@
 //! Control of jobs by users: cancel, pause, retry, delete, prioritise, list.
 
 use super::*;
+use crate::schedule::Requirements;
 
 pub async fn a_paused_job_assigns_nothing_and_accepts_results(store: Arc<dyn Store>) {
     let store = store.as_ref();
@@ -41,6 +42,40 @@ pub async fn a_paused_job_assigns_nothing_and_accepts_results(store: Arc<dyn Sto
         let refused = store.steer(&id, event, T0 + 6004).await;
         assert!(matches!(refused, Err(StoreError::Refused(Refusal::JobEnded))), "{refused:?}");
     }
+}
+
+pub async fn open_work_has_the_waiting_and_leased_tasks_of_running_jobs(store: Arc<dyn Store>) {
+    let store = store.as_ref();
+    // Tenant, limit, waiting tasks, leased tasks.
+    type Found = (String, u32, Vec<(TaskId, u64)>, Vec<TaskId>);
+    let work = async || -> Vec<Found> {
+        let tasks = |needs: &[Requirements]| needs.iter().map(|need| need.task).collect();
+        let of_job = |job: OpenWork| {
+            let waiting =
+                job.waiting.iter().map(|(need, not_before_ms)| (need.task, *not_before_ms)).collect();
+            (job.tenant.to_string(), job.max_parallel, waiting, tasks(&job.leased))
+        };
+        store.open_work().await.unwrap().into_iter().map(of_job).collect()
+    };
+    assert_eq!(work().await, []);
+    let id = planned_job(store, 1, 2).await;
+    let tenant = Tenant::default().to_string();
+    do_next(store, Stage::Global.task(), T0 + 20).await;
+    let [first, second] = [0, 1].map(|number| Stage::Partition.task_of(number));
+    let lease = claim(store, &Stage::of_workers(), T0 + 30).await.unwrap().lease;
+    assert_eq!(work().await, [(tenant.clone(), 0, vec![(second, T0 + 20)], vec![first])]);
+
+    // After an error it waits again, at first in back-off.
+    store.fail(&lease, FailClass::Training, "a fault".into(), T0 + 40).await.unwrap();
+    let limit = Event::Update { priority: None, max_parallel: Some(7) };
+    store.steer(&id, limit, T0 + 41).await.unwrap();
+    let ready = store.ready().await.unwrap();
+    let again_ms = ready.iter().find(|ready| ready.need.task == first).map_or(0, |ready| ready.not_before_ms);
+    assert!(again_ms >= T0 + 40 + rules().backoff_ms, "{again_ms}");
+    let waiting = vec![(first, again_ms), (second, T0 + 20)];
+    assert_eq!(work().await, [(tenant, 7, waiting, vec![])]);
+    store.steer(&id, Event::Pause { reason: String::new() }, T0 + 42).await.unwrap();
+    assert_eq!(work().await, [], "a paused job needs no worker");
 }
 
 pub async fn the_duration_of_a_stage_excludes_pauses(store: Arc<dyn Store>) {

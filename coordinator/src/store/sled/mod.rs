@@ -54,8 +54,8 @@ use super::{
 use crate::access::TokenRecord;
 use crate::datasets::{DatasetId, DatasetRecord, NewDataset};
 use crate::schedule::{
-    Attempt, Event, Expired, JobId, JobRecord, Lease, LiveProgress, Outcome, Quota, ReadyTask, Refusal,
-    Renewed, Rules, TaskId, TaskRecord, Tenant, Usage,
+    Attempt, Event, Expired, JobId, JobRecord, Lease, LiveProgress, OpenWork, Outcome, Quota, ReadyTask,
+    Refusal, Renewed, Rules, TaskId, TaskRecord, Tenant, Usage,
 };
 
 /// Options for opening a [`SledStore`].
@@ -267,6 +267,10 @@ impl JobStore for SledStore {
 
     async fn ready(&self) -> Result<Vec<ReadyTask>, StoreError> {
         Ok(self.live().queue.ready())
+    }
+
+    async fn open_work(&self) -> Result<Vec<OpenWork>, StoreError> {
+        Ok(self.live().queue.open_work())
     }
 
     async fn leased(&self) -> Result<Vec<(Lease, Attempt)>, StoreError> {
