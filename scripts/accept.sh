@@ -339,10 +339,10 @@ at_steps() { # scene/variant, command, file with cpu_seconds_per_step and held_o
 result = json.load(open(sys.argv[1]))
 reached = {row.get("step", row.get("iteration")): row["psnr"] for row in result["held_out"]}
 reached.setdefault(600, result.get("psnr"))
-print("%.4f %.3f %.3f %.3f" % (result["cpu_seconds_per_step"], *(reached[step] for step in (100, 300, 600))))' "$3")
+print("%.4f %.2f %.2f %.2f" % (result["cpu_seconds_per_step"], *(reached[step] for step in (100, 300, 600))))' "$3")
     read -r cpu at_100 at_300 at_600 <<<"$said"
     row "$1" "$2" "$cpu CPU s a step; $at_100, $at_300, $at_600 dB after 100, 300, 600 steps" "cpu_s_per_step=$cpu" \
-        "psnr_100=$at_100" "psnr_300=$at_300" "psnr=$at_600" "current=$cpu CPU s a step; $at_100, $at_300, $at_600 dB"
+        "psnr_100=$at_100" "psnr_300=$at_300" "psnr=$at_600" "current=$(printf '%.3f CPU s a step; %.1f, %.1f, %.1f dB' "$cpu" "$at_100" "$at_300" "$at_600")"
 }
 
 # Quality per CPU time, against OpenSplat's 27.88 dB in 219 CPU seconds: 28 dB in 220, with a target of 110.
