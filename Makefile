@@ -21,8 +21,9 @@ test: setup ## every test; those that need a GPU run on Mesa's CPU driver
 	@scripts/drivers.sh fetch || true
 	cargo test --workspace
 
-check: ## formatting, lints, documentation, shaders, protos, tidiness; CI runs this before the tests
+check: ## formatting, lints, scripts, documentation, shaders, protos, tidiness; CI runs this before the tests
 	@cargo fmt --all --check
+	scripts/shellcheck.sh
 	cargo clippy --workspace --all-targets -- -D warnings
 	RUSTDOCFLAGS="-D warnings" cargo doc --workspace --no-deps
 	cargo test --workspace --test shaders_validate --test languages --test compatible --test tidy

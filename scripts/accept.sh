@@ -322,7 +322,7 @@ vksplat() {
             trainer vksplat-ours "$scenes/fox" "${settings[@]}" || return 0
             at_steps "fox/ours" "train_scene fox ${settings[*]}" "$out/vksplat-ours.json"
         else
-            theirs=(--steps 600 --cap 13500 --initial-points 10000 --width-limit 400 --evaluate-at 100,300,600
+            theirs=(--steps 600 --cap 13500 --initial-points 10000 --width-limit 400 --evaluate-at '100,300,600'
                 --sh-interval 1 --refine-start 0 --refine-every 50)
             python3 scripts/peers/vksplat.py "$scenes/fox" "${theirs[@]}" >"$out/vksplat.json" 2>"$out/vksplat.log" ||
                 { miss "VkSplat fails, see $out/vksplat.log"; return 0; }
@@ -451,10 +451,10 @@ water_long() {
 
 # The wreck in waters that were not used for tuning: beta_d, beta_b, b_inf.
 declare -A waters=(
-    [green]=.45,.16,.20:.38,.20,.24:.05,.14,.12 [blue]=.24,.06,.04:.20,.08,.06:.015,.08,.17
-    [clear]=.20,.05,.03:.16,.07,.05:.01,.06,.16 [clearest]=.22,.06,.02:.18,.05,.03:.005,.04,.12
-    [coast]=.30,.08,.05:.25,.10,.08:.02,.10,.20 [brown]=.40,.20,.30:.30,.22,.32:.03,.10,.06
-    [turbid]=.60,.30,.35:.50,.35,.40:.06,.12,.08 [hazy]=.25,.10,.07:.35,.20,.15:.04,.12,.20 [air]=0,0,0:0,0,0:0,0,0
+    [green]=".45,.16,.20:.38,.20,.24:.05,.14,.12" [blue]=".24,.06,.04:.20,.08,.06:.015,.08,.17"
+    [clear]=".20,.05,.03:.16,.07,.05:.01,.06,.16" [clearest]=".22,.06,.02:.18,.05,.03:.005,.04,.12"
+    [coast]=".30,.08,.05:.25,.10,.08:.02,.10,.20" [brown]=".40,.20,.30:.30,.22,.32:.03,.10,.06"
+    [turbid]=".60,.30,.35:.50,.35,.40:.06,.12,.08" [hazy]=".25,.10,.07:.35,.20,.15:.04,.12,.20" [air]="0,0,0:0,0,0:0,0,0"
 )
 can_make_wrecks() {
     have sesa-mesh || return 1

@@ -56,7 +56,7 @@ fetch() {
     (cd "$folder/package" && apt-get download -qq chromium-common >/dev/null 2>&1) || return 1
     # Moved into place when it is whole: what is there is taken for complete.
     dpkg-deb -x "$folder"/package/chromium-common_*.deb "$folder/package/unpacked" || return 1
-    rm -rf "$folder/usr"
+    rm -rf "${folder:?}/usr"
     mv "$folder/package/unpacked/usr" "$folder/usr"
     rm -rf "$folder/package"
     chromium=$folder/usr/lib/chromium
@@ -255,8 +255,8 @@ drivers=("${@:-${ALL[@]}}")
 [ "$#" -gt 0 ] || drivers=("${ALL[@]}")
 if ! fetch; then
     say "SwiftShader and the validation layer are not at hand (Debian's chromium-common); only lavapipe is tested"
-    drivers=($(printf '%s\n' "${drivers[@]}" | grep -v swiftshader))
-    parts=($(printf '%s\n' "${parts[@]}" | grep -v validation))
+    mapfile -t drivers < <(printf '%s\n' "${drivers[@]}" | grep -v swiftshader)
+    mapfile -t parts < <(printf '%s\n' "${parts[@]}" | grep -v validation)
 fi
 build
 row driver part result figure

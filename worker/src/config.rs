@@ -83,8 +83,9 @@ impl Serialize for IdleLimit {
 
 impl<'de> Deserialize<'de> for IdleLimit {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        let text = String::deserialize(deserializer)?;
-        text.parse().map_err(|error| D::Error::custom(format!("exit_when_idle: {error}")))
+        let text = String::deserialize(deserializer)
+            .map_err(|_| D::Error::custom("write a time in quotes, such as \"120s\""))?;
+        text.parse().map_err(D::Error::custom)
     }
 }
 

@@ -93,7 +93,7 @@ pub struct WorkerSettings {
     #[arg(long, value_name = "TIME", env = "FATHOM_EXIT_WHEN_IDLE")]
     exit_when_idle: Option<IdleLimit>,
     /// End after so many tasks of each GPU [default: no limit]
-    #[arg(long, value_name = "N", env = "FATHOM_MAX_TASKS")]
+    #[arg(long, value_name = "N", env = "FATHOM_MAX_TASKS", value_parser = one_or_more)]
     max_tasks: Option<NonZeroU32>,
 }
 
@@ -119,6 +119,10 @@ impl Declaration for WorkerSettings {
         defaults["coordinator"] = Dial::default().url.into();
         Ok(defaults)
     }
+}
+
+fn one_or_more(text: &str) -> std::result::Result<NonZeroU32, String> {
+    text.parse().map_err(|_| "use a whole number from 1 on".to_owned())
 }
 
 impl RunArgs {
@@ -270,6 +274,7 @@ mod tests {
             ("gpu = [0, 'all']", "the GPUs 0, all: use either numbers or all"),
             ("gpus = 1", "unknown key `gpus`"),
             ("exit_when_idle = '1 minuet'", "exit_when_idle: unknown time unit \"minuet\""),
+            ("exit_when_idle = 5", "exit_when_idle: write a time in quotes, such as \"120s\""),
             ("exit_when_idle = '10ms'", "exit_when_idle: use at least 1s"),
             ("job_log_level = 'loud'", "job_log_level: use off, error, warn, info or debug"),
         ] {
