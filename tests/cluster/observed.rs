@@ -4,7 +4,8 @@
 #[path = "../support/cluster.rs"]
 mod support;
 
-use std::collections::{BTreeMap, HashSet};
+use std::collections::{BTreeMap, BTreeSet, HashSet};
+use std::path::Path;
 use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 
@@ -316,4 +317,46 @@ async fn late_log_lines_are_stored_once_under_their_own_lease() {
     let of_successor: Vec<String> =
         cluster.logs(of_successor).await.into_iter().map(|entry| entry.message).collect();
     assert_eq!(of_successor, ["of the successor", "after the end"]);
+}
+
+/// Names of metrics in a text, without the endings that a histogram or a counter gives its series.
+fn metrics_in(text: &str) -> BTreeSet<String> {
+    let is_part = |c: char| c.is_ascii_lowercase() || c == '_';
+    let names = text.split(|c: char| !is_part(c)).filter(|word| word.starts_with("fathom_"));
+    let plain = |name: &str| {
+        let ends = ["_bucket", "_sum", "_count", "_total"];
+        ends.iter().find_map(|end| name.strip_suffix(end)).unwrap_or(name).to_owned()
+    };
+    names.map(plain).collect()
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn every_metric_has_its_line_and_dashboards_name_no_others() {
+    let read = |file: &str| {
+        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("..").join(file);
+        std::fs::read_to_string(&path).unwrap_or_else(|error| panic!("{file}: {error}"))
+    };
+    let documented = metrics_in(&read("docs/operating/metrics.md"));
+    for file in ["deploy/grafana-dashboard.json", "deploy/prometheus-alerts.yaml"] {
+        let named = metrics_in(&read(file));
+        assert!(named.len() > 5, "{file} names {named:?}");
+        let unknown: Vec<_> = named.difference(&documented).collect();
+        assert!(unknown.is_empty(), "{file} names {unknown:?}, which docs/operating/metrics.md lacks");
+    }
+    serde_json::from_str::<serde_json::Value>(&read("deploy/grafana-dashboard.json")).expect("JSON");
+
+    let cluster = TestCluster::start().await;
+    let at = free_address();
+    let _worker = cluster.worker_with_metrics(FakeTrainer::quick(), Some(at));
+    let job = cluster.submit("all metrics", 2).await;
+    cluster.finished(&job).await;
+    let pages = cluster.page("/metrics").await.1 + &page(at, "/metrics").await.1;
+    let served: BTreeSet<String> = pages
+        .lines()
+        .filter_map(|line| line.strip_prefix("# TYPE ")?.split(' ').next())
+        .flat_map(metrics_in)
+        .collect();
+    assert!(served.len() > 20, "{served:?}");
+    let undocumented: Vec<_> = served.difference(&documented).collect();
+    assert!(undocumented.is_empty(), "docs/operating/metrics.md lacks {undocumented:?}");
 }

@@ -344,3 +344,42 @@ fn every_setting_is_declared_and_documented() {
     check::<CoordinatorSettings>();
     check::<WorkerSettings>();
 }
+
+/// Names like `FATHOM_LISTEN` in a text.
+fn variables_in(text: &str) -> Vec<String> {
+    let is_part = |c: char| c.is_ascii_uppercase() || c == '_';
+    let words = text.split(|c: char| !is_part(c));
+    words.filter(|word| word.starts_with("FATHOM_") && word.len() > 7).map(str::to_owned).collect()
+}
+
+#[test]
+fn variables_that_deploy_and_its_pages_name_exist() {
+    let root = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("..");
+    // The token itself, and the file of settings, are no keys of a file.
+    let mut known =
+        vec!["FATHOM_TOKEN".to_owned(), "FATHOM_CONFIG".to_owned(), "FATHOM_WORKER_CONFIG".to_owned()];
+    for [_, variable, ..] in service_settings::<CoordinatorSettings>() {
+        known.push(variable);
+    }
+    for [_, variable, ..] in service_settings::<WorkerSettings>() {
+        known.push(variable);
+    }
+    let mut named = 0;
+    for file in [
+        "deploy/Dockerfile",
+        "deploy/compose.yaml",
+        "deploy/fathom-workers.sbatch",
+        "deploy/fathom-coordinator.service",
+        "deploy/fathom-worker.service",
+        "docs/operating/containers.md",
+        "docs/operating/workers-on-demand.md",
+        "docs/operating/several-machines.md",
+    ] {
+        let text = std::fs::read_to_string(root.join(file)).unwrap_or_else(|error| panic!("{file}: {error}"));
+        for variable in variables_in(&text) {
+            named += 1;
+            assert!(known.contains(&variable), "{file} names {variable}, which no setting has");
+        }
+    }
+    assert!(named > 15, "only {named} variables were found");
+}
