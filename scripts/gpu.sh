@@ -90,7 +90,7 @@ layer() {
 
 # Sizes of a run. On a GPU: those that peers publish. `points_per_view` gives over a million points.
 settings() {
-    local sizes='"repeats": 20, "entries": "1000000,4000000", "short_iterations": 300,
+    local sizes='"repeats": 20, "entries": "1000000,4000000", "short_iterations": 3000,
   "stages": {"1m": [1000000, 1920, 1080], "3m": [3000000, 1920, 1080]},
   "fox": {"iterations": 12000, "max_gaussians": 300000, "max_resolution": 1920, "minute": 60},
   "wreck": {"iterations": 12000, "max_gaussians": 300000, "max_resolution": 1920},

@@ -27,6 +27,8 @@ use serde_json::{Value, json};
 mod cpu_time;
 #[path = "shared/floor.rs"]
 mod floor;
+#[path = "shared/grown_frame.rs"]
+mod grown_frame;
 #[path = "shared/primitives.rs"]
 mod primitives;
 #[path = "shared/random_scene.rs"]
@@ -34,6 +36,7 @@ mod random_scene;
 
 use cpu_time::cpu_seconds;
 use floor::{BACKWARD_RATE, FORWARD_RATE, floor_cpu_seconds};
+use grown_frame::grown_frame;
 use primitives::{KEY_BITS, Primitive, Primitives};
 
 type Fallible<T> = Result<T, Box<dyn Error>>;
@@ -129,18 +132,7 @@ impl Step {
                 format!("{width}x{height} has too many tiles for one band; take a smaller picture").into()
             );
         }
-        let mut frame = Frame::new(gpu, n, n, n.saturating_mul(8))?;
-        loop {
-            frame.prepare_targets(gpu, view.size)?;
-            let mut recorder = Recorder::new(gpu);
-            frame.record_forward(gpu, &mut recorder, &blocks, &view)?;
-            recorder.submit();
-            let Some(overflow) = frame.overflow(gpu)? else { break };
-            if !overflow.fits(frame.limits()) {
-                return Err(format!("{n} Gaussians need longer lists than can be bound: {overflow:?}").into());
-            }
-            frame.grow(gpu, overflow)?;
-        }
+        let frame = grown_frame(gpu, &blocks, &view)?;
         let pixels = u64::from(width) * u64::from(height);
         let v_image = gpu.buffer("v_image", pixels * 16)?;
         gpu.write(&v_image, 0, &vec![0.3_f32; pixels as usize * 4]);

@@ -15,11 +15,15 @@ use std::fs;
 use std::sync::Arc;
 
 use fathom_core::config::Moments;
-use fathom_core::gpu::{Blocks, Frame, FrameUniform, Gpu, GpuOptions, Recorder, StepUniform, sh_stride};
+use fathom_core::gpu::{Blocks, FrameUniform, Gpu, GpuOptions, Recorder, StepUniform, sh_stride};
 use fathom_core::train::{BackwardBuffers, record_backward};
 
+#[path = "shared/grown_frame.rs"]
+mod grown_frame;
 #[path = "shared/random_scene.rs"]
 mod random_scene;
+
+use grown_frame::grown_frame;
 
 type Fallible<T> = Result<T, Box<dyn Error>>;
 
@@ -63,15 +67,7 @@ fn iteration(gpu: &Arc<Gpu>, n: u32, width: u32, height: u32) -> Fallible<[Vec<f
     blocks.push_trainable(gpu, &random_scene::model(n), n, Moments::F32)?;
     let (camera, pose) = random_scene::camera(width, height);
     let view = FrameUniform { sh_degree: 3, ..FrameUniform::of_camera(&camera, &pose, gpu.tile()) };
-    let mut frame = Frame::new(gpu, n, n, n.saturating_mul(16))?;
-    loop {
-        frame.prepare_targets(gpu, view.size)?;
-        let mut recorder = Recorder::new(gpu);
-        frame.record_forward(gpu, &mut recorder, &blocks, &view)?;
-        recorder.submit();
-        let Some(overflow) = frame.overflow(gpu)? else { break };
-        frame.grow(gpu, overflow)?;
-    }
+    let frame = grown_frame(gpu, &blocks, &view)?;
     let pixels = width as usize * height as usize;
     let v_image = gpu.buffer("v_image", pixels as u64 * 16)?;
     gpu.write(&v_image, 0, &vec![0.3_f32; pixels * 4]);

@@ -68,7 +68,6 @@ class Kit:
         self.environment = dict(os.environ)
         self.adapter, self.is_cpu = None, False
         self.events = []
-        self.part = None
         self.background = {}
         self.sampler = Sampler(self)
         self.parts = self.read("parts.json", {})
@@ -91,13 +90,13 @@ class Kit:
         with open(self.out / "log.txt", "a", encoding="utf-8", errors="replace") as file:
             file.write(text.rstrip("\n") + "\n")
 
-    def run(self, *command, seconds=120, environment=None, folder=None):
+    def run(self, *command, seconds=120, environment=None):
         """The standard output of a command. Its process group is killed after `seconds`, or at the limit."""
         command = [str(word) for word in command]
         seconds = max(1.0, min(seconds, self.left() - 5))
         self.log("$ " + " ".join(command))
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, errors="replace",
-                                   cwd=folder or self.work, env={**self.environment, **(environment or {})},
+                                   cwd=self.work, env={**self.environment, **(environment or {})},
                                    start_new_session=True)
         try:
             out, err = process.communicate(timeout=seconds)

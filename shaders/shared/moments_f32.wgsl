@@ -2,9 +2,8 @@
 // coefficients. Needs adam.wgsl.
 //
 //   moments     [N*6]  vec4: first, then second moments of the transform
-//   sh_moments  [N*S*2] vec4: first and second moment of each vec4 of sh_coeffs, one after the other. One
-//               array for
-//                       both: some adapters allow a kernel 10 storage buffers
+//   sh_moments  [N*S*2] vec4: first and second moment of each vec4 of sh_coeffs, one after the other. They
+//               share one array, since some adapters allow a kernel only 10 storage buffers
 
 @group(0) @binding(10) var<storage, read_write> moments: array<vec4<f32>>;
 @group(0) @binding(11) var<storage, read_write> sh_moments: array<vec4<f32>>;

@@ -8,6 +8,7 @@
 
 mod demand;
 
+use std::collections::HashMap;
 use std::io;
 use std::sync::{Arc, Mutex, PoisonError, Weak};
 use std::time::{Duration, Instant};
@@ -46,15 +47,12 @@ struct Look {
     taken: Instant,
     now_ms: u64,
     work: Vec<OpenWork>,
-    quotas: Vec<(Tenant, Quota)>,
+    quotas: HashMap<Tenant, Quota>,
 }
 
 impl Look {
     fn value(&self, pool: &Pool) -> u64 {
-        let quota_of = |tenant: &Tenant| {
-            self.quotas.iter().find(|(of, _)| of == tenant).map_or_else(Quota::default, |(_, quota)| *quota)
-        };
-        pool.value(&self.work, quota_of, self.now_ms)
+        pool.value(&self.work, |tenant| self.quotas.get(tenant).copied().unwrap_or_default(), self.now_ms)
     }
 }
 
@@ -103,10 +101,10 @@ impl Scaler {
 
 async fn look_at(shared: &State) -> Result<Look, StoreError> {
     let (taken, now_ms, work) = (Instant::now(), shared.clock.now_ms(), shared.jobs.open_work().await?);
-    let mut quotas: Vec<(Tenant, Quota)> = Vec::new();
-    for job in &work {
-        if !quotas.iter().any(|(tenant, _)| *tenant == job.tenant) {
-            quotas.push((job.tenant.clone(), shared.store.quota(&job.tenant).await?));
+    let mut quotas = HashMap::new();
+    for OpenWork { tenant, .. } in &work {
+        if !quotas.contains_key(tenant) {
+            quotas.insert(tenant.clone(), shared.store.quota(tenant).await?);
         }
     }
     Ok(Look { taken, now_ms, work, quotas })
