@@ -17,8 +17,9 @@ build: setup ## the binary `fathom`
 demo: build ## trains a synthetic wreck with two workers in 2x2 partitions, without a GPU on the CPU
 	@scripts/demo.sh
 
-test: setup ## every test; those that need a GPU run on Mesa's CPU driver
-	@scripts/drivers.sh fetch || true
+test: ## every test; those that need a GPU run on Mesa's CPU driver, those of a database on a PostgreSQL that is installed
+	@scripts/setup.sh --for-tests
+	scripts/drivers.sh fetch || true
 	cargo test --workspace
 
 check: ## formatting, lints, scripts, documentation, shaders, protos, tidiness; CI runs this before the tests

@@ -2,7 +2,8 @@
 # Prepares a machine to build and run Fathom: Rust is required, everything else is installed here.
 #
 # Installs only a Vulkan loader and Mesa's drivers (which include lavapipe, the CPU driver), and only if no
-# Vulkan driver is found. Otherwise does nothing.
+# Vulkan driver is found. With --for-tests, also PostgreSQL, whose server the tests start and stop themselves.
+# Otherwise does nothing.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -35,11 +36,19 @@ have_driver() {
         || compgen -G "/usr/local/share/vulkan/icd.d/$drivers" >/dev/null
 }
 
+have_postgres() {
+    command -v initdb >/dev/null || compgen -G '/usr/lib/postgresql/*/bin/initdb' >/dev/null
+}
+
 packages=()
 [ "${needs_linker:-no}" = yes ] && packages+=(gcc libc6-dev)
 if [ "$(uname -s)" = Linux ]; then
     have_loader || packages+=(libvulkan1)
     have_driver || packages+=(mesa-vulkan-drivers)
+fi
+# Without apt-get, tests of a database are skipped.
+if [ "${1:-}" = --for-tests ] && ! have_postgres && command -v apt-get >/dev/null; then
+    packages+=(postgresql)
 fi
 
 if [ "${#packages[@]}" -gt 0 ]; then

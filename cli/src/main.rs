@@ -42,7 +42,9 @@ fn main() -> ExitCode {
     let level = if fathom.verb.is_service() { "info" } else { "warn" };
     let _log = fathom_observe::init(&Logging {
         format: fathom.log_format,
-        default_filter: format!("{level},wgpu_core=warn,wgpu_hal=error,naga=warn,sled=warn"),
+        default_filter: format!(
+            "{level},wgpu_core=warn,wgpu_hal=error,naga=warn,sled=warn,sqlx=warn,sqlx_core=warn"
+        ),
         captures: fathom.verb.is_service(),
         service: fathom.verb.service(),
     });

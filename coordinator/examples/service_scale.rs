@@ -4,9 +4,10 @@
 //! ```text
 //! cargo run --release --example service_scale -- [PARTITIONS] [WORKERS] [SECONDS]
 //! ```
-//! 10,000 partitions, 1000 workers and 60 seconds by default. The store is the real one on the real disk. The
-//! workers call over gRPC on loopback from this process, renew every 15 seconds as with the default lease,
-//! and train nothing. The printed CPU time is that of coordinator and workers together.
+//! 10,000 partitions, 1000 workers and 60 seconds by default. The store is the real one on the real disk;
+//! with `FATHOM_STORE=postgres://…`, that database, which must be empty. The workers call over gRPC on
+//! loopback from this process, renew every 15 seconds as with the default lease, and train nothing. The
+//! printed CPU time is that of coordinator and workers together.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -16,7 +17,9 @@ use std::time::{Duration, Instant};
 use fathom_coordinator::schedule::{
     Event, JobId, Lease, Planned, PlannedTask, Rules, Stage, TaskOutput, Tenant, WorkerProfile,
 };
-use fathom_coordinator::store::{Claim, JobStore, NewJob, SledOptions, SledStore};
+use fathom_coordinator::store::{
+    Claim, NewJob, PostgresOptions, PostgresStore, SledOptions, SledStore, Store,
+};
 use fathom_coordinator::{CoordinatorConfig, serve};
 use fathom_core::scene::BlobRef;
 use fathom_proto::dial::{Connection, Dial};
@@ -50,9 +53,18 @@ async fn main() -> Result<(), Failure> {
 
 async fn measure(dir: &Path, partitions: usize, workers: usize, seconds: u64) -> Result<(), Failure> {
     let data_dir = dir.join("data");
-    let options =
-        SledOptions { dir: data_dir.join("store"), rules: Rules::default(), lease_ms: 60_000, stall_ms: 0 };
-    let store = Arc::new(SledStore::open(&options)?);
+    let url = std::env::var("FATHOM_STORE").ok();
+    let (rules, lease_ms, stall_ms) = (Rules::default(), 60_000, 0);
+    let store: Arc<dyn Store> = match &url {
+        Some(url) => {
+            let options = PostgresOptions { url: url.clone(), rules, lease_ms, stall_ms, connections: 32 };
+            Arc::new(PostgresStore::open(&options).await?)
+        }
+        None => {
+            let options = SledOptions { dir: data_dir.join("store"), rules, lease_ms, stall_ms };
+            Arc::new(SledStore::open(&options)?)
+        }
+    };
     acknowledgements(store.as_ref()).await?;
     let job = plan(store.as_ref(), partitions).await?;
     claims(&store, &job, partitions / 2).await?;
@@ -61,6 +73,7 @@ async fn measure(dir: &Path, partitions: usize, workers: usize, seconds: u64) ->
     let begin = Instant::now();
     let config = CoordinatorConfig {
         data_dir,
+        store: url,
         listen: ([127, 0, 0, 1], 0).into(),
         min_free_bytes: 0,
         ..CoordinatorConfig::default()
@@ -97,7 +110,7 @@ fn ms(time: Duration) -> f64 {
 }
 
 /// One writer, one job after another, each durable before the next.
-async fn acknowledgements(store: &SledStore) -> Result<(), Failure> {
+async fn acknowledgements(store: &dyn Store) -> Result<(), Failure> {
     let mut took = Vec::new();
     for number in 1..=ACKNOWLEDGEMENTS {
         let begin = Instant::now();
@@ -117,7 +130,7 @@ async fn acknowledgements(store: &SledStore) -> Result<(), Failure> {
 }
 
 /// A job at its partitions.
-async fn plan(store: &SledStore, partitions: usize) -> Result<JobId, Failure> {
+async fn plan(store: &dyn Store, partitions: usize) -> Result<JobId, Failure> {
     let id = store.submit(new_job(0), NOW_MS).await?.job_id;
     let plan = take(store, Stage::Plan, "plan".into()).await?.ok_or("no plan to make")?;
     let task = |index: u32| {
@@ -136,7 +149,7 @@ async fn plan(store: &SledStore, partitions: usize) -> Result<JobId, Failure> {
     Ok(id)
 }
 
-async fn take(store: &SledStore, stage: Stage, request_id: String) -> Result<Option<Lease>, Failure> {
+async fn take(store: &dyn Store, stage: Stage, request_id: String) -> Result<Option<Lease>, Failure> {
     let worker = WorkerProfile {
         name: "bench".into(),
         incarnation: "bench".into(),
@@ -150,14 +163,14 @@ async fn take(store: &SledStore, stage: Stage, request_id: String) -> Result<Opt
 }
 
 /// Several concurrent claims, each lease durable before its use, and their results.
-async fn claims(store: &Arc<SledStore>, job: &JobId, count: usize) -> Result<(), Failure> {
+async fn claims(store: &Arc<dyn Store>, job: &JobId, count: usize) -> Result<(), Failure> {
     let begin = Instant::now();
     let lanes = (0..CLAIMERS).map(|lane| {
         let store = Arc::clone(store);
         tokio::spawn(async move {
             let mut leases = Vec::new();
             for call in 0..count / CLAIMERS {
-                let lease = take(&store, Stage::Partition, format!("{lane} {call}")).await?;
+                let lease = take(store.as_ref(), Stage::Partition, format!("{lane} {call}")).await?;
                 leases.push(lease.ok_or("nothing left to claim")?);
             }
             Ok::<_, Failure>(leases)

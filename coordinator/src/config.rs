@@ -15,6 +15,11 @@ use crate::schedule::{Quota, Rules};
 pub struct CoordinatorConfig {
     /// Folder of jobs and blobs; created if missing. One process at a time. Default "fathom-data".
     pub data_dir: PathBuf,
+    /// URL of a PostgreSQL database for jobs, `postgres://USER@HOST:PORT/DATABASE`; the password may be in it,
+    /// in `PGPASSWORD` or in a password file. Default none: a store in `data_dir`.
+    pub store: Option<String>,
+    /// Maximum connections to that database. Default 32, at least 2.
+    pub store_connections: u32,
     /// Where to listen; port 0 takes a free one. Default 127.0.0.1:7420.
     pub listen: SocketAddr,
     /// Where to serve metrics and health over HTTP, neither encrypted nor authenticated; port 0 takes a free
@@ -88,6 +93,8 @@ impl Default for CoordinatorConfig {
     fn default() -> Self {
         Self {
             data_dir: PathBuf::from("fathom-data"),
+            store: None,
+            store_connections: 32,
             listen: SocketAddr::from((Ipv4Addr::LOCALHOST, 7420)),
             metrics_listen: None,
             scaler_listen: None,
@@ -149,6 +156,10 @@ impl CoordinatorConfig {
                 || self.scaler_listen.is_none_or(|listen| listen.ip().is_loopback()),
             "scaler_listen is reachable from other machines, and anyone could read how many tasks there are: set tls_cert, \
              tls_key and scaler_client_ca, or insecure = true",
+        );
+        require(
+            self.store_connections >= 2,
+            "store_connections must be at least 2: one of them is for renewals",
         );
         require(self.lease_ms >= 1000, "lease_ms must be at least 1000: workers renew every quarter of it");
         require(self.lease_ms <= 86_400_000, "lease_ms must be at most a day");

@@ -1,9 +1,11 @@
-//! Maintenance of a data directory while no coordinator runs on it: export, import, verification.
+//! Maintenance of a store: export, import, verification. On a data directory, no coordinator may run
+//! meanwhile; a database gives a consistent view while one runs.
 //!
-//! Read-only operations open a copy of the store in a separate folder. The original stays unchanged to the
-//! byte, and may be on a disk that is read-only or full.
+//! Read-only operations open a copy of the store of a data directory in a separate folder. The original stays
+//! unchanged to the byte, and may be on a disk that is read-only or full.
 
 use std::collections::BTreeSet;
+use std::fmt;
 use std::path::{Path, PathBuf};
 
 use fathom_core::scene::{BlobRef, Manifest};
@@ -18,7 +20,29 @@ use crate::own_tasks::artifacts::ArtifactIndex;
 use crate::references::{Reference, references};
 use crate::schedule::{Artifact, Rules, Tenant};
 use crate::store::export::{Export, JobExport};
-use crate::store::{AccessStore, SledOptions, SledStore, Store, StoreError, sync_folder, verify};
+use crate::store::{
+    AccessStore, PostgresOptions, PostgresStore, SledOptions, SledStore, Store, StoreError, sync_folder,
+    verify,
+};
+
+/// Where the rows and the files of jobs are.
+#[derive(Clone, Debug)]
+pub struct Place {
+    /// The data directory of the coordinator.
+    pub data_dir: PathBuf,
+    /// URL of the database that has its jobs; `None`: they are in `data_dir`.
+    pub store: Option<String>,
+}
+
+/// The database without its URL, which may contain a password; or the data directory.
+impl fmt::Display for Place {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self.store {
+            Some(_) => f.write_str("the database"),
+            None => self.data_dir.display().fmt(f),
+        }
+    }
+}
 
 /// Content of a store.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -57,38 +81,39 @@ impl Counts {
     }
 }
 
-/// Writes all jobs of a data directory into one file. Photographs and models are not in it: they are files in
+/// Writes all jobs of a store into one file. Photographs and models are not in it: they are files in
 /// `objects`, of other tenants than the default one in `tenants`. The directory is only read: a copy of its
 /// store is opened in `scratch`, or in the system's folder for temporary files.
 ///
 /// # Errors
 /// When a coordinator runs on the directory, there is no store in it, it is damaged, or the copy or the file
 /// cannot be written.
-pub async fn export(
-    data_dir: &Path,
-    scratch: Option<&Path>,
-    file: &Path,
-) -> Result<Counts, CoordinatorError> {
-    let export = open_copy(data_dir, scratch)?.export().await?;
+pub async fn export(place: &Place, scratch: Option<&Path>, file: &Path) -> Result<Counts, CoordinatorError> {
+    let export = open_to_read(place, scratch).await?.export().await?;
     export.write(file)?;
     Ok(Counts::of(&export))
 }
 
-/// Creates the store of a data directory from such a file.
+/// Creates the store of a data directory from such a file, or fills an empty database.
 ///
 /// # Errors
-/// When the directory already has a store, the file is damaged, or its content violates the rules. Nothing is
-/// left behind then.
-pub async fn import(file: &Path, data_dir: &Path) -> Result<Counts, CoordinatorError> {
+/// When there is a store already, the database cannot be reached, the file is damaged, or its content
+/// violates the rules. Nothing is left behind then.
+pub async fn import(file: &Path, place: &Place) -> Result<Counts, CoordinatorError> {
     let refuse = |message: String| Err(CoordinatorError::Maintenance(message));
+    if let Some(url) = &place.store {
+        let export = sound_export(file)?;
+        let store = open_database(url).await?;
+        store.import(&export).await?;
+        store.close().await;
+        return Ok(Counts::of(&export));
+    }
+    let data_dir = place.data_dir.as_path();
     let (store, staged) = (data_dir.join("store"), data_dir.join("store.importing"));
     if store.exists() {
         return refuse(format!("{} already exists; import into a new data directory", store.display()));
     }
-    let export = Export::read(file)?;
-    if let Some(fault) = verify::faults(&export).first() {
-        return refuse(format!("{}: {fault}; nothing was imported", file.display()));
-    }
+    let export = sound_export(file)?;
     let failed =
         |error: std::io::Error| CoordinatorError::Maintenance(format!("{}: {error}", staged.display()));
     if staged.exists() {
@@ -103,13 +128,24 @@ pub async fn import(file: &Path, data_dir: &Path) -> Result<Counts, CoordinatorE
     Ok(Counts::of(&export))
 }
 
-/// Issues a token in the store of a data directory, for when no operator has one any more. Returns the text
+/// An export without faults.
+fn sound_export(file: &Path) -> Result<Export, CoordinatorError> {
+    let export = Export::read(file)?;
+    match verify::faults(&export).first() {
+        None => Ok(export),
+        Some(fault) => {
+            Err(CoordinatorError::Maintenance(format!("{}: {fault}; nothing was imported", file.display())))
+        }
+    }
+}
+
+/// Issues a token in a store, for when no operator has one any more. Returns the text
 /// to show.
 ///
 /// # Errors
 /// When a coordinator runs on the directory, there is no store in it, or the token's settings are invalid.
 pub async fn issue_token(
-    data_dir: &Path,
+    place: &Place,
     name: &str,
     role: Role,
     tenant: &str,
@@ -118,17 +154,22 @@ pub async fn issue_token(
     let life_seconds = u64::from(days) * 24 * 60 * 60;
     let issued = TokenRecord::issue(name.to_owned(), role, tenant, life_seconds, Clock::start().now_ms());
     let (token, record) = issued.map_err(|error| CoordinatorError::Maintenance(error.to_string()))?;
-    let store = SledStore::open(&options(&store_of(data_dir)?)).map_err(|error| busy(data_dir, error))?;
-    store.put_token(&record).await?;
+    match &place.store {
+        Some(url) => open_database(url).await?.put_token(&record).await?,
+        None => {
+            let store = SledStore::open(&options(&store_of(&place.data_dir)?));
+            store.map_err(|error| busy(&place.data_dir, error))?.put_token(&record).await?;
+        }
+    }
     Ok(token.reveal())
 }
 
-/// All tokens in the store of a data directory, by time of issue, read from a copy as by [`export`].
+/// All tokens in a store, by time of issue, read from a copy as by [`export`].
 ///
 /// # Errors
 /// As [`export`].
-pub async fn tokens(data_dir: &Path, scratch: Option<&Path>) -> Result<Vec<TokenRecord>, CoordinatorError> {
-    let mut tokens = open_copy(data_dir, scratch)?.tokens().await?;
+pub async fn tokens(place: &Place, scratch: Option<&Path>) -> Result<Vec<TokenRecord>, CoordinatorError> {
+    let mut tokens = open_to_read(place, scratch).await?.tokens().await?;
     tokens.sort_by(|a, b| (a.created_ms, &a.id).cmp(&(b.created_ms, &b.id)));
     Ok(tokens)
 }
@@ -158,14 +199,16 @@ pub fn keep_backup(backup: &[u8], file: &Path) -> Result<Counts, CoordinatorErro
 /// # Errors
 /// When a coordinator runs on the directory, there is no store in it, a row cannot be read, or the copy
 /// cannot be written.
-pub async fn verify(
-    data_dir: &Path,
-    scratch: Option<&Path>,
-    deep: bool,
-) -> Result<Verified, CoordinatorError> {
-    let store = open_copy(data_dir, scratch)?;
-    let mut faults = store.index_faults()?;
-    let export = store.export().await?;
+pub async fn verify(place: &Place, scratch: Option<&Path>, deep: bool) -> Result<Verified, CoordinatorError> {
+    let data_dir = place.data_dir.as_path();
+    let (export, mut faults) = match &place.store {
+        Some(url) => open_database(url).await?.verified().await?,
+        None => {
+            let store = open_copy(data_dir, scratch)?;
+            let faults = store.index_faults()?;
+            (store.export().await?, faults)
+        }
+    };
     faults.extend(verify::faults(&export));
     let mut verified = Verified { counts: Counts::of(&export), faults, ..Verified::default() };
     // Missing files of an upload are not a fault.
@@ -309,6 +352,27 @@ fn store_of(data_dir: &Path) -> Result<PathBuf, CoordinatorError> {
         "{} contains no store; pass the --data-dir of a coordinator",
         data_dir.display()
     )))
+}
+
+/// A store for read-only operations.
+async fn open_to_read(place: &Place, scratch: Option<&Path>) -> Result<Box<dyn Store>, CoordinatorError> {
+    Ok(match &place.store {
+        Some(url) => Box::new(open_database(url).await?),
+        None => Box::new(open_copy(&place.data_dir, scratch)?),
+    })
+}
+
+/// The store in a database, beside the coordinator that uses it.
+async fn open_database(url: &str) -> Result<PostgresStore, CoordinatorError> {
+    // Rules and times are not used: nothing is leased here.
+    let options = PostgresOptions {
+        url: url.to_owned(),
+        rules: Rules::default(),
+        lease_ms: 60_000,
+        stall_ms: 0,
+        connections: 2,
+    };
+    Ok(PostgresStore::open(&options).await?)
 }
 
 /// A copy of the store of a data directory, for read-only operations.

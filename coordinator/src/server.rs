@@ -40,7 +40,7 @@ use crate::retention::{Housekeeping, Policy, RetentionError, collect, collect_ga
 use crate::scaler;
 use crate::services::{Admin, Jobs, Uploads, Workers, logs, release_disowned};
 use crate::state::{State, stopped};
-use crate::store::{SledOptions, SledStore, Store};
+use crate::store::{PostgresOptions, PostgresStore, SledOptions, SledStore, Store};
 use crate::sweep::sweep_leases;
 use crate::tls::Tls;
 use crate::wakeups::Wakeups;
@@ -159,15 +159,7 @@ pub async fn serve(config: CoordinatorConfig) -> Result<Coordinator, Coordinator
     let clock = Clock::start();
     data_dir::make(&config.data_dir)?;
     let objects = TenantBlobs::open(&config.data_dir, config.min_free_bytes, clock)?;
-    let options = SledOptions {
-        dir: config.data_dir.join("store"),
-        rules: config.rules(),
-        lease_ms: config.lease_ms.into(),
-        stall_ms: config.stall_ms.into(),
-    };
-    let store = tokio::task::spawn_blocking(move || SledStore::open(&options))
-        .await
-        .map_err(|e| CoordinatorError::Server(e.to_string()))??;
+    let store = open_store(&config).await?;
     let house = config.housekeeping();
     let room = Room::of_this_process();
     let mut coordinator =
@@ -178,6 +170,23 @@ pub async fn serve(config: CoordinatorConfig) -> Result<Coordinator, Coordinator
         tokio::spawn(scaler::serve(Arc::clone(&coordinator.shared), listener, tls));
     }
     Ok(coordinator)
+}
+
+/// The store that the configuration names, for this process alone.
+async fn open_store(config: &CoordinatorConfig) -> Result<Arc<dyn Store>, CoordinatorError> {
+    let (rules, lease_ms, stall_ms) = (config.rules(), config.lease_ms.into(), config.stall_ms.into());
+    if let Some(url) = &config.store {
+        let connections = config.store_connections;
+        let options = PostgresOptions { url: url.clone(), rules, lease_ms, stall_ms, connections };
+        let held = data_dir::hold_for_database(&config.data_dir, &options.place()?)?;
+        let store = PostgresStore::open(&options).await?;
+        store.hold_alone(held).await?;
+        return Ok(Arc::new(store));
+    }
+    data_dir::refuse_if_of_database(&config.data_dir)?;
+    let options = SledOptions { dir: config.data_dir.join("store"), rules, lease_ms, stall_ms };
+    let opened = tokio::task::spawn_blocking(move || SledStore::open(&options)).await;
+    Ok(Arc::new(opened.map_err(|error| CoordinatorError::Server(error.to_string()))??))
 }
 
 /// Starts a coordinator on a given store, clock and connections, with given settings of garbage collection,
@@ -202,7 +211,7 @@ where
     let objects = TenantBlobs::open(&config.data_dir, config.min_free_bytes, clock)?;
     let incoming = incoming.filter_map(|accepted| std::future::ready(accepted.ok().map(|io| (io, None))));
     let room = Room::of_descriptors(None);
-    start(config, tls, objects, store, clock, house, None, room, incoming).await
+    start(config, tls, objects, Arc::new(store), clock, house, None, room, incoming).await
 }
 
 /// TLS where the configuration has it, once the configuration is found to be free of contradictions.
@@ -214,11 +223,11 @@ fn tls_of(config: &CoordinatorConfig) -> Result<Option<Arc<Tls>>, CoordinatorErr
     Tls::read(config)
 }
 
-async fn start<S, I, C>(
+async fn start<I, C>(
     config: CoordinatorConfig,
     tls: Option<Arc<Tls>>,
     objects: TenantBlobs,
-    store: S,
+    store: Arc<dyn Store>,
     clock: Clock,
     house: Housekeeping,
     for_metrics: Option<(TcpListener, SocketAddr)>,
@@ -226,7 +235,6 @@ async fn start<S, I, C>(
     incoming: I,
 ) -> Result<Coordinator, CoordinatorError>
 where
-    S: Store + 'static,
     I: Stream<Item = Accepted<C>> + Send + 'static,
     C: AsyncRead + AsyncWrite + Connected + Unpin + Send + 'static,
 {
@@ -239,7 +247,7 @@ where
     }
     let marks = store.worker_marks().await?.into_iter().collect();
     let access = if config.tokens {
-        if let Some(path) = ensure_operator(&store, &config.data_dir, clock.now_ms()).await? {
+        if let Some(path) = ensure_operator(store.as_ref(), &config.data_dir, clock.now_ms()).await? {
             tracing::info!(path = %path.display(), "wrote a token for the first operator");
         }
         Arc::new(Access::by_tokens(store.tokens().await?))
@@ -259,7 +267,6 @@ where
 
     let (stopping, stop_signal) = watch::channel(false);
     let metrics = Arc::new(Metrics::default());
-    let store: Arc<dyn Store> = Arc::new(store);
     let shared = Arc::new(State {
         jobs: Arc::new(CountedStore { store: Arc::clone(&store), metrics: Arc::clone(&metrics) }),
         store,
@@ -382,7 +389,7 @@ where
     let house = collect_garbage(Arc::clone(&shared), look_every);
     let disowned = release_disowned(Arc::clone(&shared));
     let sweeper = sweep_leases(shared);
-    // All of them end on stop: open calls are answered, own tasks are left for the next process.
+    // All of them end on stop: open calls are answered, own tasks are given back.
     tokio::pin!(server, sweeper, own_tasks, house, disowned);
     let mut own_tasks_run = true;
     let mut sweeper_runs = true;
@@ -391,7 +398,13 @@ where
     loop {
         tokio::select! {
             biased;
-            served = &mut server => return served.map_err(|e| CoordinatorError::Server(e.to_string())),
+            served = &mut server => {
+                if own_tasks_run {
+                    // They give their tasks back.
+                    let _ = tokio::time::timeout(STOP_WITHIN / 2, &mut own_tasks).await;
+                }
+                return served.map_err(|e| CoordinatorError::Server(e.to_string()));
+            }
             swept = &mut sweeper, if sweeper_runs => {
                 swept?;
                 sweeper_runs = false;

@@ -262,7 +262,16 @@ impl From<ServiceError> for Status {
                 StoreError::RowTooLarge { .. } => (Code::InvalidArgument, "ROW_TOO_LARGE"),
                 StoreError::Unwritable { .. } => (Code::Internal, "ROW_UNWRITABLE"),
                 StoreError::NotEmpty => (Code::FailedPrecondition, "STORE_NOT_EMPTY"),
-                StoreError::InUse { .. } | StoreError::NoCopy { .. } | StoreError::Failed(_) => {
+                StoreError::InUse { .. }
+                | StoreError::NoCopy { .. }
+                | StoreError::BadUrl
+                | StoreError::DatabaseInUse
+                | StoreError::OtherSchema { .. }
+                | StoreError::Failed(_) => (Code::Unavailable, "STORE_FAILED"),
+                StoreError::Unavailable(error) => {
+                    // Clients must not learn addresses of this network. The sweeper reports it once.
+                    tracing::debug!(%error, "the database is not available");
+                    message = "the coordinator's database is not available; repeat the call".into();
                     (Code::Unavailable, "STORE_FAILED")
                 }
             },

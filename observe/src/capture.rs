@@ -115,6 +115,8 @@ impl AttemptLines {
         let most = match metadata.target() {
             target if target.starts_with("fathom") => LevelFilter::TRACE,
             target if target.starts_with("wgpu_hal") => LevelFilter::ERROR,
+            // Slow statements are the operator's matter.
+            target if target.starts_with("sqlx") => LevelFilter::ERROR,
             _ => LevelFilter::WARN,
         };
         *metadata.level() <= level().min(most)

@@ -17,6 +17,8 @@ mod hostile;
 mod logs;
 #[cfg(unix)]
 mod on_demand;
+#[path = "../support/postgres.rs"]
+mod postgres;
 #[path = "../support/processes.rs"]
 mod processes;
 mod render;

@@ -87,3 +87,44 @@ fn a_data_directory_is_exported_verified_and_restored() {
     assert!(error.contains("contains no store"), "{error}");
     assert!(!Path::new(&at("nowhere")).exists(), "a wrong path made a store");
 }
+
+#[test]
+fn a_service_moves_to_a_database_and_back() {
+    let Some(database) = crate::postgres::database() else { return };
+    let folder = tempfile::tempdir().expect("a folder");
+    let at = |name: &str| under(folder.path(), name);
+    let (data, file, back) = (at("data"), at("store.gz"), at("back.gz"));
+    let scene = tiny_scene(folder.path());
+    // The same request at each coordinator: it makes one job.
+    let submit = |more: &[&str]| {
+        let flags = [&["--data-dir", &data, "--listen", "127.0.0.1:0"], more].concat();
+        let (_coordinator, url) = Service::coordinator_with(&flags);
+        let words = ["submit", &scene, "--coordinator", &url, "--iterations=50", "--request-id=once"];
+        succeed(&words).trim().to_owned()
+    };
+    let store = format!("--store={database}");
+    let job = submit(&[]);
+    succeed(&["store", "export", "--data-dir", &data, "-o", &file]);
+    let said = succeed(&["store", "import", &file, &store]);
+    assert!(said.starts_with("1 jobs, ") && said.contains("into the database"), "{said}");
+    let (_, error) = fail(&["store", "import", &file, &store]);
+    assert!(error.contains("already contains jobs"), "{error}");
+    // With both, it would be unclear which store is the right one.
+    let (_, error) = fail(&["coordinator", "--data-dir", &data, &store, "--listen=127.0.0.1:0"]);
+    assert!(error.contains("has a store of its own"), "{error}");
+    std::fs::rename(at("data/store"), at("data/store.moved")).expect("a folder");
+    let verified = json(&["store", "verify", "--data-dir", &data, &store, "--deep", "--json"]);
+    assert_eq!((&verified["jobs"], verified["faults"].as_array().map(Vec::len)), (&1.into(), Some(0)));
+    assert_eq!(submit(&[&store]), job, "a repeated request made another job");
+
+    let (_, error) = fail(&["coordinator", "--data-dir", &data, "--listen=127.0.0.1:0"]);
+    assert!(error.contains("are in the database") && error.contains("--store"), "{error}");
+    let wrong = "--store=postgres://fathom:secret@127.0.0.1:1/fathom";
+    let (_, error) = fail(&["store", "export", wrong, "-o", &back]);
+    assert!(error.contains("is not available") && !error.contains("secret"), "{error}");
+    assert!(!Path::new(&back).exists());
+    succeed(&["store", "export", &store, "-o", &back]);
+    succeed(&["store", "import", &back, "--data-dir", &data]);
+    std::fs::remove_file(at("data/database.lock")).expect("its file");
+    assert_eq!(submit(&[]), job, "a repeated request made another job");
+}

@@ -9,6 +9,7 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 use serde_json::Value;
 
 use crate::history::{Acknowledged, History};
+use crate::postgres::{Disk, Server};
 use crate::process::{Process, Random};
 use crate::processes::{free_port, output_of, under};
 use crate::reference;
@@ -43,6 +44,8 @@ pub struct Harness {
     pub port: u16,
     pub rules: Rules,
     coordinator: Option<Process>,
+    /// The database of its jobs, and its URL; without one, they are in the data directory.
+    database: Option<(Server, String)>,
     workers: BTreeMap<String, Process>,
     jobs: Vec<String>,
     /// Killed processes.
@@ -75,6 +78,17 @@ impl Harness {
         harness
     }
 
+    /// The same with its jobs in a database of its own; `None` where PostgreSQL is missing.
+    pub fn on_database(scenario: &'static str) -> Option<Self> {
+        let server = Server::start(Disk::Synced)?;
+        let url = server.database();
+        // Longer than a pool takes to connect again.
+        let mut harness = Self::stopped(scenario, Rules { lease_ms: 3000, ..Rules::default() });
+        harness.database = Some((server, url));
+        harness.start_coordinator();
+        Some(harness)
+    }
+
     /// Starts no process yet.
     pub fn stopped(scenario: &'static str, rules: Rules) -> Self {
         let folder = tempfile::tempdir().expect("a temporary folder");
@@ -88,6 +102,7 @@ impl Harness {
             port: free_port(),
             rules,
             coordinator: None,
+            database: None,
             workers: BTreeMap::new(),
             jobs: Vec::new(),
             kills: 0,
@@ -122,7 +137,7 @@ impl Harness {
     /// As [`Harness::start_coordinator`], but may fail; returns whether it serves.
     pub fn try_coordinator(&mut self) -> bool {
         let Rules { lease_ms, max_losses, min_free_bytes } = &self.rules;
-        let arguments = [
+        let mut arguments = vec![
             "coordinator".to_owned(),
             "--stop-with-stdin".to_owned(),
             "--backoff-ms=100".to_owned(),
@@ -132,6 +147,7 @@ impl Harness {
             format!("--max-losses={max_losses}"),
             format!("--min-free-bytes={min_free_bytes}"),
         ];
+        arguments.extend(self.database.as_ref().map(|(_, url)| format!("--store={url}")));
         let mut process = Process::start("coordinator", &arguments, &self.log_folder());
         let ready = process.line().is_some_and(|line| line.starts_with("listening on http://"));
         self.coordinator = Some(process);
@@ -145,6 +161,38 @@ impl Harness {
     pub fn kill_coordinator(&mut self) {
         self.coordinator().kill();
         self.kills += 1;
+    }
+
+    pub fn has_database(&self) -> bool {
+        self.database.is_some()
+    }
+
+    /// Kills the database server, and starts it again after `pause`.
+    pub fn kill_database(&mut self, pause: Duration) {
+        let (server, _) = self.database.as_mut().expect("a database");
+        server.kill();
+        std::thread::sleep(pause);
+        server.resume();
+        self.kills += 1;
+    }
+
+    /// Starts another coordinator on the database, which must be refused; what it says.
+    pub fn refused_coordinator(&self) -> String {
+        let (_, url) = self.database.as_ref().expect("a database");
+        let other = self.path("other-data");
+        Self::refused_start(&["coordinator", "--data-dir", &other, "--store", url, "--listen", "127.0.0.1:0"])
+    }
+
+    /// Starts a coordinator on the data directory without its database; what it says.
+    pub fn refused_without_store(&self) -> String {
+        let data = self.data.to_string_lossy();
+        Self::refused_start(&["coordinator", "--data-dir", &data, "--listen", "127.0.0.1:0"])
+    }
+
+    fn refused_start(words: &[&str]) -> String {
+        let Output { status, stderr, .. } = output_of(words);
+        assert!(!status.success(), "fathom {} was not refused", words.join(" "));
+        String::from_utf8_lossy(&stderr).into_owned()
     }
 
     /// A worker that shares its photograph cache with other scenarios.
@@ -287,7 +335,11 @@ impl Harness {
         self.workers.clear();
         self.kill_coordinator();
         let data = self.data.to_string_lossy().into_owned();
-        let found = output_of(&["store", "verify", "--data-dir", &data, "--deep", "--json"]);
+        let mut verify = vec!["store", "verify", "--data-dir", &data, "--deep", "--json"];
+        if let Some((_, url)) = &self.database {
+            verify.extend(["--store", url]);
+        }
+        let found = output_of(&verify);
         let said = String::from_utf8_lossy(&found.stdout).into_owned();
         assert!(found.status.success(), "the coordinator left damaged data: {said}");
     }
@@ -319,6 +371,10 @@ impl Harness {
         let made = std::process::Command::new("mkfifo").args(&pipes).status();
         assert!(made.expect("mkfifo").success(), "pipes could not be made");
         pipes
+    }
+
+    pub fn log_of(&self, process: &str) -> String {
+        self.logs().into_iter().find(|(name, _)| name == process).map(|(_, log)| log).unwrap_or_default()
     }
 
     fn logs(&self) -> Vec<(String, String)> {

@@ -10,11 +10,14 @@
 //! `make soak` kills for longer (`FATHOM_KILLS_ROUNDS`).
 #![cfg(unix)]
 
+#[path = "../support/postgres.rs"]
+mod postgres;
 #[path = "../support/processes.rs"]
 mod processes;
 
 mod clients;
 mod coordinators;
+mod databases;
 mod disks;
 mod harness;
 mod history;

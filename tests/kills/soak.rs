@@ -13,21 +13,39 @@ const FAULTS: u64 = 8;
 
 #[test]
 fn random_kills_of_everything_change_no_byte() {
-    kill_at_random("random_kills_of_everything_change_no_byte", 1);
+    let scenario = "random_kills_of_everything_change_no_byte";
+    kill_at_random(scenario, || Some(Harness::new(scenario)), 1);
+}
+
+#[test]
+fn random_kills_with_a_database_change_no_byte() {
+    let scenario = "random_kills_with_a_database_change_no_byte";
+    kill_at_random(scenario, || Harness::on_database(scenario), 1);
 }
 
 #[test]
 #[ignore = "duration is configurable; run `make soak`"]
 fn random_kills_for_long_change_no_byte() {
-    let rounds =
-        std::env::var("FATHOM_KILLS_ROUNDS").ok().and_then(|rounds| rounds.parse().ok()).unwrap_or(40);
-    kill_at_random("random_kills_for_long_change_no_byte", rounds);
+    let scenario = "random_kills_for_long_change_no_byte";
+    kill_at_random(scenario, || Some(Harness::new(scenario)), rounds());
+}
+
+#[test]
+#[ignore = "duration is configurable; run `make soak`"]
+fn random_kills_for_long_with_a_database_change_no_byte() {
+    let scenario = "random_kills_for_long_with_a_database_change_no_byte";
+    kill_at_random(scenario, || Harness::on_database(scenario), rounds());
+}
+
+fn rounds() -> u32 {
+    std::env::var("FATHOM_KILLS_ROUNDS").ok().and_then(|rounds| rounds.parse().ok()).unwrap_or(40)
 }
 
 /// Number of faults, and their cost.
 #[derive(Default)]
 struct Figures {
     coordinators: u32,
+    databases: u32,
     workers: u32,
     stopped: u32,
     asked_to_leave: u32,
@@ -55,13 +73,14 @@ struct Chaos {
     disturbed: Vec<Instant>,
 }
 
-fn kill_at_random(scenario: &'static str, rounds: u32) {
+fn kill_at_random(scenario: &'static str, harness: impl FnOnce() -> Option<Harness>, rounds: u32) {
     if !can_train(scenario) {
         return;
     }
     let begin = Instant::now();
+    let Some(harness) = harness() else { return };
     let mut chaos = Chaos {
-        harness: Harness::new(scenario),
+        harness,
         figures: Figures::default(),
         living: Vec::new(),
         born: 0,
@@ -102,7 +121,7 @@ fn kill_at_random(scenario: &'static str, rounds: u32) {
 
 impl Chaos {
     fn kills(&self) -> u32 {
-        self.figures.coordinators + self.figures.workers
+        self.figures.coordinators + self.figures.databases + self.figures.workers
     }
 
     fn start_worker(&mut self) {
@@ -120,6 +139,14 @@ impl Chaos {
     /// One fault, repaired after less or more than a lease period.
     fn strike(&mut self) {
         let lease = self.harness.rules.lease_ms;
+        if self.harness.has_database() && self.harness.random.below(3) == 0 {
+            self.disturbed.push(Instant::now());
+            let pause = Duration::from_millis(self.harness.random.below(2 * lease));
+            self.harness.kill_database(pause);
+            self.figures.databases += 1;
+            self.disturbed.push(Instant::now());
+            return;
+        }
         match self.harness.random.below(10) {
             0..4 => self.kill_coordinator(),
             4..7 => self.kill_worker(),
@@ -202,9 +229,9 @@ impl Chaos {
 
 impl Figures {
     fn said(&self) -> String {
-        let Self { coordinators, workers, stopped, asked_to_leave, events, .. } = self;
+        let Self { coordinators, databases, workers, stopped, asked_to_leave, events, .. } = self;
         format!(
-            "coordinators {coordinators}, workers {workers}; {stopped} processes stopped, {asked_to_leave} \
+            "coordinators {coordinators}, databases {databases}, workers {workers}; {stopped} processes stopped, {asked_to_leave} \
              workers asked to leave; {events} events of tasks without a gap, and no acknowledgement lost\n\
              coordinator from start to ready, ms: {}\nlease taken back after a worker's kill, leases: {}\n\
              task given to another worker, leases: {}\nwork lost by a kill, seconds: {}; iterations: {}",

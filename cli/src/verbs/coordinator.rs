@@ -36,6 +36,13 @@ pub struct CoordinatorSettings {
     /// Folder for jobs, photographs and results, for one coordinator at a time
     #[arg(long, value_name = "DIR", env = "FATHOM_DATA_DIR")]
     data_dir: Option<PathBuf>,
+    /// PostgreSQL database for jobs, postgres://USER@HOST:PORT/DATABASE; give the password in PGPASSWORD or
+    /// a password file [default: a store in the data folder]
+    #[arg(long, value_name = "URL", env = "FATHOM_STORE", hide_env_values = true)]
+    store: Option<String>,
+    /// Maximum connections to that database, at least 2
+    #[arg(long, value_name = "N", env = "FATHOM_STORE_CONNECTIONS")]
+    store_connections: Option<u32>,
     /// Address or host name to listen on; beyond this machine it needs TLS and tokens; port 0 takes a free
     /// one
     #[arg(long, value_name = "ADDRESS:PORT", env = "FATHOM_LISTEN", value_parser = super::parse_address)]

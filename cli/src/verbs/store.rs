@@ -1,10 +1,10 @@
-//! `fathom store`: backs up and checks a coordinator's data directory. All verbs but `backup` need a stopped
-//! coordinator; `export` and `verify` open a copy of the store and change nothing.
+//! `fathom store`: backs up, moves and checks the jobs of a coordinator. On a data directory, all verbs but
+//! `backup` need a stopped coordinator; `export` and `verify` open a copy of the store and change nothing.
 
 use std::path::PathBuf;
 
 use clap::{Args, Subcommand};
-use fathom_coordinator::maintenance::{self, Counts};
+use fathom_coordinator::maintenance::{self, Counts, Place};
 use serde_json::json;
 
 use super::ServiceArgs;
@@ -43,7 +43,7 @@ enum What {
         #[arg(short, long, value_name = "FILE")]
         output: PathBuf,
     },
-    /// Create the store of a new data directory from an exported file
+    /// Create the store of a new data directory, or fill an empty database, from an exported file
     Import {
         /// A file written by `fathom store export` or `backup`
         #[arg(value_name = "FILE")]
@@ -63,15 +63,24 @@ enum What {
     },
 }
 
-/// The data directory.
+/// The data directory, and the database if it has the jobs.
 #[derive(Args, Debug)]
 struct DataDir {
-    /// Data directory of the coordinator, which must be stopped
+    /// Data directory of the coordinator, which must be stopped, except with --store
     #[arg(long, value_name = "DIR", env = "FATHOM_DATA_DIR", default_value = "fathom-data")]
     data_dir: PathBuf,
+    /// PostgreSQL database of the coordinator, which may run [default: its jobs are in the data directory]
+    #[arg(long, value_name = "URL", env = "FATHOM_STORE", hide_env_values = true)]
+    store: Option<String>,
     /// Print as JSON
     #[arg(long)]
     json: bool,
+}
+
+impl DataDir {
+    fn place(&self) -> Place {
+        Place { data_dir: self.data_dir.clone(), store: self.store.clone() }
+    }
 }
 
 /// Folder for the temporary copy of a store that is only read.
@@ -92,18 +101,17 @@ pub async fn run(args: StoreArgs) -> Result<()> {
             print_counts(counts, json, &format!("backed up to {}", output.display()))
         }
         What::Export { data, copy, output } => {
-            let counts = maintenance::export(&data.data_dir, copy.scratch.as_deref(), &output)
-                .await
-                .map_err(failed)?;
+            let counts =
+                maintenance::export(&data.place(), copy.scratch.as_deref(), &output).await.map_err(failed)?;
             print_counts(counts, data.json, &format!("exported to {}", output.display()))
         }
         What::Import { file, data } => {
-            let counts = maintenance::import(&file, &data.data_dir).await.map_err(failed)?;
-            print_counts(counts, data.json, &format!("imported into {}", data.data_dir.display()))
+            let counts = maintenance::import(&file, &data.place()).await.map_err(failed)?;
+            print_counts(counts, data.json, &format!("imported into {}", data.place()))
         }
         What::Verify { data, copy, deep } => {
             let found =
-                maintenance::verify(&data.data_dir, copy.scratch.as_deref(), deep).await.map_err(failed)?;
+                maintenance::verify(&data.place(), copy.scratch.as_deref(), deep).await.map_err(failed)?;
             if data.json {
                 let Counts { jobs, tasks, events, datasets } = found.counts;
                 output::json(&json!({
@@ -120,7 +128,7 @@ pub async fn run(args: StoreArgs) -> Result<()> {
                 0 => Ok(()),
                 count => Err(CliError::Message(format!(
                     "{count} faults in {}; restore it from an export and a copy of its folder objects",
-                    data.data_dir.display()
+                    data.place()
                 ))),
             }
         }

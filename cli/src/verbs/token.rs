@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::{Args, Subcommand, ValueEnum};
 use fathom_coordinator::access;
-use fathom_coordinator::maintenance;
+use fathom_coordinator::maintenance::{self, Place};
 use fathom_proto::admin::v1::{IssueTokenRequest, Role, Token};
 use prost_types::Timestamp;
 use serde_json::{Value, json};
@@ -48,6 +48,9 @@ struct IssueArgs {
     /// more
     #[arg(long, value_name = "DIR")]
     data_dir: Option<PathBuf>,
+    /// The same in the PostgreSQL database of a coordinator; valid from its next start
+    #[arg(long, value_name = "URL")]
+    store: Option<String>,
     #[command(flatten)]
     service: ServiceArgs,
     /// Print as JSON
@@ -60,6 +63,9 @@ struct ListArgs {
     /// List the tokens in the data directory of a stopped coordinator; the directory is only read
     #[arg(long, value_name = "DIR")]
     data_dir: Option<PathBuf>,
+    /// List the tokens in the PostgreSQL database of a coordinator
+    #[arg(long, value_name = "URL")]
+    store: Option<String>,
     #[command(flatten)]
     copy: CopyArgs,
     #[command(flatten)]
@@ -105,15 +111,21 @@ pub async fn run(args: TokenArgs) -> Result<()> {
     }
 }
 
+/// The store to read or write instead of calling the service.
+fn place(data_dir: Option<&PathBuf>, store: Option<&String>) -> Option<Place> {
+    let is_named = data_dir.is_some() || store.is_some();
+    is_named.then(|| Place { data_dir: data_dir.cloned().unwrap_or_default(), store: store.cloned() })
+}
+
 async fn issue(args: IssueArgs) -> Result<()> {
-    if let Some(data_dir) = &args.data_dir {
+    if let Some(place) = place(args.data_dir.as_ref(), args.store.as_ref()) {
         let role = match args.role {
             RoleArg::Viewer => access::Role::Viewer,
             RoleArg::Submitter => access::Role::Submitter,
             RoleArg::Operator => access::Role::Operator,
             RoleArg::Worker => access::Role::Worker,
         };
-        let made = maintenance::issue_token(data_dir, &args.name, role, &args.tenant, args.days).await;
+        let made = maintenance::issue_token(&place, &args.name, role, &args.tenant, args.days).await;
         let secret = made.map_err(|error| CliError::Message(error.to_string()))?;
         return print_secret(&secret, json!({"token": secret}), args.json);
     }
@@ -145,11 +157,11 @@ fn print_secret(secret: &str, value: Value, json: bool) -> Result<()> {
 }
 
 async fn list(args: ListArgs) -> Result<()> {
-    let (tokens, of) = match &args.data_dir {
-        Some(data_dir) => {
-            let stored = maintenance::tokens(data_dir, args.copy.scratch.as_deref()).await;
+    let (tokens, of) = match place(args.data_dir.as_ref(), args.store.as_ref()) {
+        Some(place) => {
+            let stored = maintenance::tokens(&place, args.copy.scratch.as_deref()).await;
             let stored = stored.map_err(|error| CliError::Message(error.to_string()))?;
-            (stored.iter().map(of_store).collect(), format!("in {}", data_dir.display()))
+            (stored.iter().map(of_store).collect(), format!("in {place}"))
         }
         None => {
             let client = args.service.client().await?;

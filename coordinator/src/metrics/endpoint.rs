@@ -48,6 +48,7 @@ impl Observed for Endpoint {
         if let Some(failure) = shared.jobs.failure() {
             return Err(StoreError::Failed(failure).to_string());
         }
+        shared.jobs.answers().await.map_err(|error| error.to_string())?;
         shared.objects.check_space(0).await.map_err(|error| error.to_string())
     }
 }

@@ -151,6 +151,14 @@ impl JobStore for CountedStore {
         self.store.recover(now_ms).await
     }
 
+    async fn answers(&self) -> Result<(), StoreError> {
+        self.store.answers().await
+    }
+
+    async fn extend_leases(&self, now_ms: u64) -> Result<(), StoreError> {
+        self.store.extend_leases(now_ms).await
+    }
+
     async fn job(&self, job: &JobId) -> Result<JobView, StoreError> {
         self.store.job(job).await
     }

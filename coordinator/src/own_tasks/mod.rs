@@ -22,7 +22,7 @@ use uuid::Uuid;
 
 use crate::schedule::{Event, Renewed, Stage, TaskOutput, WorkerProfile};
 use crate::state::{State, stopped};
-use crate::store::{Claim, Grant};
+use crate::store::{Claim, Grant, StoreError};
 pub use error::OwnTaskError;
 
 /// Maximum concurrent own tasks: a long merge must not delay the plan of another job.
@@ -62,6 +62,8 @@ async fn run_lane(shared: Arc<State>, incarnation: String) {
                 continue;
             }
             Ok(None) => {}
+            // The sweeper reports it, four times a second would be too often.
+            Err(StoreError::Unavailable(_)) => {}
             // A failed store ends the server; see `sweep_leases`.
             Err(error) => tracing::error!(%error, "cannot claim own tasks"),
         }
@@ -92,24 +94,40 @@ async fn run_task(shared: &State, grant: Grant, stopping: &mut watch::Receiver<b
                     return;
                 }
             }
-            // The next process runs it again.
-            () = stopped(stopping) => return,
+            () = stopped(stopping) => {
+                // Otherwise the next process would wait for the end of the lease.
+                let reason = "the coordinator stops".to_owned();
+                if let Err(error) = shared.jobs.release(&lease, reason, shared.clock.now_ms()).await {
+                    tracing::debug!(%error, "the next process finds the lease of an own task");
+                }
+                return;
+            }
         }
     };
-    let now_ms = shared.clock.now_ms();
-    let answer = match result {
+    let event = match result {
         Ok(output) => {
             tracing::info!(seconds = begin.elapsed().as_secs_f64(), "task done");
-            shared.jobs.complete(&lease, output, now_ms).await
+            Event::Complete { lease: lease.clone(), output }
         }
         Err(OwnTaskError { message, lost, .. }) if !lost.is_empty() => {
             tracing::error!(%message, "results are damaged; their tasks are requeued");
-            let event = Event::ResultsLost { lease: lease.clone(), tasks: lost, message };
-            shared.jobs.apply(&lease.job, event, now_ms).await
+            Event::ResultsLost { lease: lease.clone(), tasks: lost, message }
         }
         Err(OwnTaskError { class, message, .. }) => {
             tracing::warn!(?class, %message, "own task failed");
-            shared.jobs.fail(&lease, class, message, now_ms).await
+            Event::Fail { lease: lease.clone(), class, message }
+        }
+    };
+    let answer = loop {
+        let applied = shared.jobs.apply(&lease.job, event.clone(), shared.clock.now_ms()).await;
+        // A merge may have taken hours. Leases are extended when the database is available again.
+        if !matches!(applied, Err(StoreError::Unavailable(_))) {
+            break applied;
+        }
+        tokio::select! {
+            biased;
+            () = stopped(stopping) => break applied,
+            () = tokio::time::sleep(LOOK_EVERY) => {}
         }
     };
     if let Err(error) = answer {

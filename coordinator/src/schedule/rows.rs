@@ -58,7 +58,12 @@ impl Rules {
     /// Whether a task may be claimed. A time later than the longest back-off comes from a wall clock that was
     /// set back between two runs, and is ignored.
     pub fn is_due(&self, not_before_ms: u64, now_ms: u64) -> bool {
-        not_before_ms <= now_ms || not_before_ms > now_ms + self.max_backoff_ms + self.max_backoff_ms / 4
+        not_before_ms <= now_ms || not_before_ms > now_ms + self.longest_pause_ms()
+    }
+
+    /// The longest time from a failure to the next attempt, milliseconds.
+    pub fn longest_pause_ms(&self) -> u64 {
+        self.max_backoff_ms + self.max_backoff_ms / 4
     }
 
     /// The back-off after `failures` failures: doubling, plus up to a quarter from `salt`, so that tasks that

@@ -3,35 +3,38 @@
 //!
 //! Invariants of every implementation: acknowledged changes are durable. The rules of [`crate::schedule`] are
 //! applied inside the transaction that commits. A fence is never granted twice. [`SledStore`] is for a single
-//! machine; tests compare it with a [`MemoryStore`], the reference model, which simulations also use.
+//! machine, [`PostgresStore`] for a database server. Tests compare both with a [`MemoryStore`], the reference
+//! model, which simulations also use.
 
 #[cfg(test)]
 mod conformance;
+mod error;
 pub mod export;
 mod flusher;
 pub(crate) mod memory;
+mod postgres;
 pub(crate) mod record;
 mod sled;
 pub mod verify;
 
 use std::collections::BTreeMap;
-use std::path::PathBuf;
 use std::sync::Arc;
 
 use fathom_core::scene::BlobRef;
 use serde::{Deserialize, Serialize};
 use tonic::async_trait;
 
+pub use self::error::StoreError;
 use self::export::Export;
 pub use self::memory::MemoryStore;
+pub use self::postgres::{PostgresOptions, PostgresStore};
 pub(crate) use self::sled::sync_folder;
 pub use self::sled::{SledOptions, SledStore};
 use crate::access::TokenRecord;
 use crate::datasets::{DatasetId, DatasetRecord, MAX_DATASETS, NewDataset};
 use crate::schedule::{
     Attempt, Event, EventBody, Expired, FailClass, JobId, JobRecord, JobShape, JobState, Lease, LiveProgress,
-    Outcome, Quota, Refusal, Renewed, Stage, TaskId, TaskOutput, TaskRecord, TaskState, Tenant, Usage,
-    WorkerProfile,
+    Outcome, Quota, Renewed, Stage, TaskId, TaskOutput, TaskRecord, TaskState, Tenant, Usage, WorkerProfile,
 };
 pub use crate::schedule::{OpenWork, ReadyTask};
 
@@ -284,143 +287,6 @@ pub struct StoredEvent {
     pub body: EventBody,
 }
 
-/// Errors of a store.
-#[derive(Debug, thiserror::Error)]
-pub enum StoreError {
-    /// There is no such job.
-    #[error("there is no job {0}")]
-    JobNotFound(JobId),
-    /// One request id, two bodies.
-    #[error("request id {request_id} was used for another call before; choose a new one")]
-    RequestIdReused {
-        /// The id.
-        request_id: String,
-    },
-    /// A tenant has reached its limit of open jobs.
-    #[error("{tenant} has {limit} open jobs, which is its limit; wait until one ends, or cancel one")]
-    TooManyJobs {
-        /// The tenant.
-        tenant: Tenant,
-        /// The limit.
-        limit: u32,
-    },
-    /// The tenant has no such dataset.
-    #[error("there is no dataset {0}; `fathom dataset list` lists all datasets")]
-    DatasetNotFound(DatasetId),
-    /// A name that is already in use.
-    #[error("there is a dataset {0} with other files; choose another name, or delete that one first")]
-    DatasetExists(DatasetId),
-    /// A dataset that is still uploaded.
-    #[error("dataset {0} is not committed; upload the missing files and commit it")]
-    DatasetNotCommitted(DatasetId),
-    /// A dataset that a job uses.
-    #[error("dataset {dataset} is used by job {job}; delete that job first")]
-    DatasetInUse {
-        /// Its id.
-        dataset: DatasetId,
-        /// One of the jobs that use it.
-        job: JobId,
-    },
-    /// A tenant has reached the limit of datasets.
-    #[error("{0} has {MAX_DATASETS} datasets, which is the limit; delete some")]
-    TooManyDatasets(Tenant),
-    /// The rules forbid it.
-    #[error(transparent)]
-    Refused(#[from] Refusal),
-    /// A damaged row.
-    #[error("the store is damaged: {tree}: {message}; restore the data directory from a backup")]
-    Corrupt {
-        /// The tree.
-        tree: &'static str,
-        /// The fault.
-        message: String,
-    },
-    /// A row that is too large; nothing was written.
-    #[error(
-        "{tree}: a row of {bytes} bytes is larger than {limit}; shorten the configuration or the messages"
-    )]
-    RowTooLarge {
-        /// The tree.
-        tree: &'static str,
-        /// Its size.
-        bytes: usize,
-        /// The largest that is written.
-        limit: usize,
-    },
-    /// A row that cannot be written as JSON; nothing was written.
-    #[error("{tree}: a row cannot be written: {message}")]
-    Unwritable {
-        /// The tree.
-        tree: &'static str,
-        /// Why.
-        message: String,
-    },
-    /// A store with another row layout.
-    #[error("{}", of_another_program(*found, program.as_deref(), *known))]
-    OtherLayout {
-        /// The layout found.
-        found: u8,
-        /// Version of the program that wrote it, if recorded.
-        program: Option<String>,
-        /// The layout that this program reads.
-        known: u8,
-    },
-    /// A store that is not empty.
-    #[error("the store already contains jobs; import into a new data directory")]
-    NotEmpty,
-    /// Another process has the directory open.
-    #[error(
-        "{path} is in use by another coordinator; a data directory serves one at a time: stop the coordinator first, or \
-         start this one with another --data-dir"
-    )]
-    InUse {
-        /// The store in the data directory.
-        path: String,
-    },
-    /// No room for the copy of a store that is opened read-only.
-    #[error(
-        "the store is read from a copy, but {scratch} cannot hold it: {message}; pass --scratch DIR with enough space",
-        scratch = scratch.display()
-    )]
-    NoCopy {
-        /// The folder of the copy.
-        scratch: PathBuf,
-        /// The error of the system.
-        message: String,
-    },
-    /// The database or its disk failed. Nothing was acknowledged; the coordinator must be started again.
-    #[error("the store failed: {0}; free space or repair the disk and start the coordinator again")]
-    Failed(String),
-}
-
-/// Names both programs and a remedy: an older store is not a damaged one. The layout of the first release,
-/// 0.2.0.
-const FIRST_RELEASED: u8 = 2;
-
-fn of_another_program(found: u8, program: Option<&str>, known: u8) -> String {
-    let is_newer = found > known;
-    if found < FIRST_RELEASED {
-        return format!(
-            "the store was written by Fathom 0.1.0, which was never released, and Fathom {PROGRAM} cannot read it: start with \
-             an empty --data-dir and submit its jobs again, or finish them with the program that wrote it"
-        );
-    }
-    let writer = match program {
-        Some(version) => format!("Fathom {version}"),
-        None => format!("{} Fathom", if is_newer { "a newer" } else { "an older" }),
-    };
-    let way_out = match is_newer {
-        true => format!("start {writer} on it"),
-        false => format!(
-            "it is older, not damaged: export it with {writer} (`fathom store export`) and import the file with this one"
-        ),
-    };
-    format!(
-        "the store was written by {writer} with store layout {found}, and this is Fathom {PROGRAM}, which reads layout \
-         {known}; {way_out}"
-    )
-}
-
 /// Jobs, tasks, leases and workers.
 #[async_trait]
 pub trait JobStore: Send + Sync {
@@ -441,9 +307,18 @@ pub trait JobStore: Send + Sync {
     async fn apply(&self, job: &JobId, event: Event, now_ms: u64) -> Result<Outcome, StoreError>;
     /// Revokes the leases whose holders stopped renewing or make no progress, and returns them.
     async fn sweep(&self, now_ms: u64) -> Result<Vec<(Lease, Expired)>, StoreError>;
-    /// Call once at the start: gives every stored lease a full period of grace, and revokes those of the
-    /// coordinator's own tasks, whose process is gone.
+    /// Call once at the start: gives every stored lease a full period of grace, and revokes those of own
+    /// tasks whose coordinator is gone.
     async fn recover(&self, now_ms: u64) -> Result<(), StoreError>;
+    /// Whether the store answers now.
+    async fn answers(&self) -> Result<(), StoreError> {
+        Ok(())
+    }
+    /// Gives every lease a full period, after a time in which nobody could renew because the database was not
+    /// available. A store of one process fails for good instead.
+    async fn extend_leases(&self, _now_ms: u64) -> Result<(), StoreError> {
+        Ok(())
+    }
     /// One job with its tasks.
     async fn job(&self, job: &JobId) -> Result<JobView, StoreError>;
     /// One job alone.

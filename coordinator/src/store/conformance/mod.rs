@@ -1,13 +1,18 @@
-//! Requirements on every store, tested with both; `restart.rs` has those of a store on disk.
+//! Requirements on every store, tested with each; `restart.rs` and `sync.rs` have those of a store on disk,
+//! `postgres_only.rs` those of a database that several processes use.
 
 mod datasets;
 mod leases;
+mod postgres_only;
 mod restart;
 mod stages;
 mod steering;
 mod stragglers;
 mod sync;
 mod tenants;
+
+#[path = "../../../../tests/support/postgres.rs"]
+mod postgres_server;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -22,7 +27,7 @@ use self::stragglers::*;
 use self::tenants::*;
 use super::*;
 use crate::references::references;
-use crate::schedule::{Artifact, Planned, PlannedTask, Rules, Stage, TaskStats};
+use crate::schedule::{Artifact, Planned, PlannedTask, Refusal, Rules, Stage, TaskStats};
 
 const LEASE_MS: u64 = 1000;
 const STALL_MS: u64 = 60_000;
@@ -376,6 +381,18 @@ fn open(dir: &std::path::Path) -> SledStore {
     when_free(|| SledStore::open(&options), is_busy)
 }
 
+/// A store in PostgreSQL with the times of the tests.
+async fn open_postgres(url: &str) -> PostgresStore {
+    let options = PostgresOptions {
+        url: url.to_owned(),
+        rules: rules(),
+        lease_ms: LEASE_MS,
+        stall_ms: STALL_MS,
+        connections: 8,
+    };
+    PostgresStore::open_with_own_clock(&options).await.unwrap()
+}
+
 /// Retries `open` until it succeeds: sled's threads release a directory a moment after its last handle is
 /// dropped.
 fn when_free<T, E: std::fmt::Debug>(open: impl Fn() -> Result<T, E>, is_busy: impl Fn(&E) -> bool) -> T {
@@ -404,6 +421,14 @@ macro_rules! conformance {
             async fn $name() {
                 let dir = tempfile::tempdir().unwrap();
                 super::$name(Arc::new(open(dir.path()))).await;
+            })*
+            use super::*;
+        }
+        mod postgres {
+            $(#[tokio::test]
+            async fn $name() {
+                let Some(url) = postgres_server::database() else { return };
+                super::$name(Arc::new(open_postgres(&url).await)).await;
             })*
             use super::*;
         }

@@ -1,0 +1,210 @@
+//! Connections and migrations.
+
+use std::fs::File;
+use std::str::FromStr;
+use std::sync::atomic::AtomicU64;
+use std::sync::{Arc, OnceLock, Weak};
+use std::time::{Duration, Instant};
+
+use sqlx::migrate::{MigrateError, Migration, MigrationType, Migrator};
+use sqlx::postgres::{PgConnectOptions, PgPoolOptions};
+use sqlx::{Connection, PgConnection, PgPool, SqlSafeStr};
+
+use super::super::{PROGRAM, StoreError};
+use super::claims::Hints;
+use super::queue::WaitingChanges;
+use super::{Inner, PostgresStore, Settings, unavailable};
+use crate::schedule::Rules;
+
+/// Longest wait for a connection. The pool pauses for up to a fifth of it between attempts.
+const CONNECT_WITHIN: Duration = Duration::from_secs(3);
+/// Pause between two looks at the connection that keeps other coordinators away.
+const WATCH_EVERY: Duration = Duration::from_secs(5);
+/// Time in which the database notices that a coordinator is gone; see [`SESSION`].
+const TAKE_OVER_WITHIN: Duration = Duration::from_secs(30);
+/// The lock of the one coordinator.
+const ONE_COORDINATOR: i64 = 0x6661_7468_6f6d;
+/// The database itself ends what takes longer, so that a coordinator behind a cut network holds no lock.
+/// The same for connections whose client has gone without a word.
+const SESSION: [(&str, &str); 8] = [
+    // The same reason as for the columns of `tasks`: an index is never wrong by much.
+    ("enable_seqscan", "off"),
+    ("tcp_keepalives_idle", "10"),
+    ("tcp_keepalives_interval", "5"),
+    ("tcp_keepalives_count", "3"),
+    ("lock_timeout", "10s"),
+    ("statement_timeout", "15s"),
+    ("idle_in_transaction_session_timeout", "15s"),
+    ("client_min_messages", "warning"),
+];
+
+/// Options for opening a [`PostgresStore`].
+#[derive(Clone, Debug)]
+pub struct PostgresOptions {
+    /// `postgres://user:password@host:port/database`, with the parameters of libpq; the password may be in
+    /// `PGPASSWORD` or a password file instead.
+    pub url: String,
+    /// Budgets and back-off.
+    pub rules: Rules,
+    /// Lease duration, milliseconds.
+    pub lease_ms: u64,
+    /// Time without progress after which a worker's lease is revoked, milliseconds; 0 disables it.
+    pub stall_ms: u64,
+    /// Most connections to the database; an eighth of them, at least one, is for renewals.
+    pub connections: u32,
+}
+
+impl PostgresOptions {
+    /// Host, port and database, without secrets.
+    ///
+    /// # Errors
+    /// When the URL is wrong.
+    pub fn place(&self) -> Result<String, StoreError> {
+        let connect = connect_options(&self.url)?;
+        let host = match connect.get_socket() {
+            Some(socket) => socket.display().to_string(),
+            None => connect.get_host().to_owned(),
+        };
+        let database = connect.get_database().unwrap_or(connect.get_username());
+        Ok(format!("{host}:{}/{database}", connect.get_port()))
+    }
+}
+
+impl PostgresStore {
+    /// Connects, and creates the tables or brings them to this version.
+    ///
+    /// # Errors
+    /// When the URL is wrong, the database cannot be reached, or a newer program has changed its tables.
+    pub async fn open(options: &PostgresOptions) -> Result<Self, StoreError> {
+        Self::open_with(options, true).await
+    }
+
+    /// As [`Self::open`], with the times that callers give instead of the database's clock.
+    ///
+    /// # Errors
+    /// As [`Self::open`].
+    pub async fn open_with_own_clock(options: &PostgresOptions) -> Result<Self, StoreError> {
+        Self::open_with(options, false).await
+    }
+
+    async fn open_with(options: &PostgresOptions, by_database_clock: bool) -> Result<Self, StoreError> {
+        let connect = connect_options(&options.url)?;
+        let mut conn = PgConnection::connect_with(&connect).await.map_err(unavailable)?;
+        migrate(&mut conn).await?;
+        conn.close().await.map_err(unavailable)?;
+        let for_renewals = (options.connections / 8).max(1);
+        let pool = pool(connect.clone(), options.connections.saturating_sub(for_renewals).max(1));
+        let renewals = pool_of_renewals(connect.clone(), for_renewals);
+        let settings = Settings {
+            rules: options.rules.clone(),
+            lease_ms: options.lease_ms,
+            stall_ms: options.stall_ms,
+            by_database_clock,
+        };
+        Ok(Self(Arc::new(Inner {
+            settings,
+            pool,
+            renewals,
+            waiting: WaitingChanges::default(),
+            hints: Hints::default(),
+            version: AtomicU64::new(0),
+            grants: AtomicU64::new(0),
+            connect,
+            holds: OnceLock::new(),
+            failure: OnceLock::new(),
+        })))
+    }
+
+    /// Refuses when another coordinator uses the database, and keeps others away until this store is dropped.
+    /// `with` is held as long.
+    ///
+    /// # Errors
+    /// When another one has it, or the database cannot be reached.
+    pub async fn hold_alone(&self, with: File) -> Result<(), StoreError> {
+        let begin = Instant::now();
+        let held = loop {
+            match lock_alone(&self.0.connect).await? {
+                Some(held) => break held,
+                // The database may not have noticed yet that a killed one is gone.
+                None if begin.elapsed() < TAKE_OVER_WITHIN => tokio::time::sleep(WATCH_EVERY / 10).await,
+                None => return Err(StoreError::DatabaseInUse),
+            }
+        };
+        let watch = tokio::spawn(watch_alone(Arc::downgrade(&self.0), held, with));
+        // Once only: a store is opened for one coordinator.
+        let _ = self.0.holds.set(watch.abort_handle());
+        Ok(())
+    }
+
+    /// Closes all connections.
+    pub async fn close(self) {
+        self.0.pool.close().await;
+        self.0.renewals.close().await;
+    }
+}
+
+fn connect_options(url: &str) -> Result<PgConnectOptions, StoreError> {
+    // Its message may contain the password.
+    let connect = PgConnectOptions::from_str(url).map_err(|_| StoreError::BadUrl)?;
+    Ok(connect.application_name("fathom-coordinator").options(SESSION))
+}
+
+fn pool(connect: PgConnectOptions, connections: u32) -> PgPool {
+    let options = PgPoolOptions::new().max_connections(connections).acquire_timeout(CONNECT_WITHIN);
+    options.connect_lazy_with(connect)
+}
+
+fn pool_of_renewals(connect: PgConnectOptions, connections: u32) -> PgPool {
+    pool(connect.options([("synchronous_commit", "off")]), connections)
+}
+
+/// Creates the tables or brings them to this version; two coordinators that start together take turns.
+async fn migrate(conn: &mut PgConnection) -> Result<(), StoreError> {
+    let sql = include_str!("migrations/0001.sql").into_sql_str();
+    let first = Migration::new(1, "tables".into(), MigrationType::Simple, sql, false);
+    let migrations = Migrator::with_migrations(vec![first]);
+    migrations.run(conn).await.map_err(|error| match error {
+        MigrateError::VersionMissing(found) => StoreError::OtherSchema { found, program: PROGRAM },
+        MigrateError::VersionMismatch(version) => StoreError::Corrupt {
+            tree: "_sqlx_migrations",
+            message: format!("migration {version} is not the one of Fathom {PROGRAM}"),
+        },
+        other => StoreError::Unavailable(other.to_string()),
+    })
+}
+
+/// A connection that keeps other coordinators away; `None` if one has the database.
+async fn lock_alone(connect: &PgConnectOptions) -> Result<Option<PgConnection>, StoreError> {
+    let mut conn = PgConnection::connect_with(connect).await.map_err(unavailable)?;
+    let got: bool = sqlx::query_scalar("SELECT pg_try_advisory_lock($1)")
+        .bind(ONE_COORDINATOR)
+        .fetch_one(&mut conn)
+        .await
+        .map_err(unavailable)?;
+    Ok(got.then_some(conn))
+}
+
+/// Takes the lock again when its connection was lost; ends the store if another coordinator was faster.
+async fn watch_alone(store: Weak<Inner>, mut held: PgConnection, _with: File) {
+    let mut lost: Option<Instant> = None;
+    loop {
+        tokio::time::sleep(WATCH_EVERY).await;
+        let Some(store) = store.upgrade() else { return };
+        let lives = tokio::time::timeout(CONNECT_WITHIN, held.ping()).await;
+        if matches!(lives, Ok(Ok(()))) {
+            continue;
+        }
+        match tokio::time::timeout(CONNECT_WITHIN, lock_alone(&store.connect)).await {
+            Ok(Ok(Some(again))) => (held, lost) = (again, None),
+            Ok(Ok(None)) => {
+                // It may still be the lost connection, of which the database does not know yet.
+                if lost.get_or_insert_with(Instant::now).elapsed() > TAKE_OVER_WITHIN {
+                    let _ = store.failure.set("another coordinator has taken its database".to_owned());
+                    return;
+                }
+            }
+            // The database is not available; calls report it.
+            Ok(Err(_)) | Err(_) => {}
+        }
+    }
+}

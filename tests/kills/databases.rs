@@ -1,0 +1,50 @@
+//! Killed databases, and coordinators whose jobs are in one.
+
+use std::time::Duration;
+
+use crate::harness::Harness;
+use crate::processes::can_train;
+
+#[test]
+fn a_database_killed_twice_in_a_job_costs_no_task() {
+    let scenario = "a_database_killed_twice_in_a_job_costs_no_task";
+    if !can_train(scenario) {
+        return;
+    }
+    let Some(mut harness) = Harness::on_database(scenario) else { return };
+    harness.start_worker("first");
+    let job = harness.submit();
+    job.wait_for_checkpoint("partition-0000");
+    let lease = Duration::from_millis(harness.rules.lease_ms);
+    // Longer than a lease: nobody could renew meanwhile, and that is no silence.
+    harness.kill_database(lease * 2);
+    job.wait_for_checkpoint("partition-0001");
+    harness.kill_database(lease / 4);
+    let history = harness.succeeded(&job);
+    assert_eq!(history.losses(), 0, "a live worker was counted as lost\n{history}");
+    let log = harness.log_of("coordinator");
+    for said in ["the database is not available; calls are refused", "the database is available again"] {
+        assert!(log.contains(said), "{said}: {log}");
+    }
+    harness.check_data_dir();
+}
+
+#[test]
+fn a_coordinator_serves_only_the_jobs_of_its_files() {
+    let scenario = "a_coordinator_serves_only_the_jobs_of_its_files";
+    if !can_train(scenario) {
+        return;
+    }
+    let Some(mut harness) = Harness::on_database(scenario) else { return };
+    let job = harness.submit();
+    // A second coordinator on the same jobs would not know of this one.
+    let said = harness.refused_coordinator();
+    assert!(said.contains("in use by another coordinator"), "{said}");
+    // The coordinator would delete the files of jobs that it does not see.
+    harness.kill_coordinator();
+    let said = harness.refused_without_store();
+    assert!(said.contains("pass its --store"), "{said}");
+    harness.start_coordinator();
+    harness.start_worker("first");
+    harness.conclude(&job);
+}
