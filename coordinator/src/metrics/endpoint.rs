@@ -6,7 +6,6 @@ use std::time::{Duration, Instant};
 use fathom_observe::http::Observed;
 use prometheus_client::encoding::text;
 
-use super::labels;
 use crate::schedule::{JobState, Stage};
 use crate::state::State;
 use crate::store::{Levels, StoreError};
@@ -69,7 +68,7 @@ fn set_levels(shared: &State, now: &Levels) {
     let count = |count: usize| i64::try_from(count).unwrap_or(i64::MAX);
     for state in [Running, Paused, Succeeded, Failed, Cancelled] {
         let jobs = now.jobs.get(&state).copied().unwrap_or(0);
-        levels.jobs.get_or_create(&[("state", labels::state(state))]).set(count(jobs));
+        levels.jobs.get_or_create(&[("state", state.name())]).set(count(jobs));
     }
     for stage in Stage::all() {
         let of_stage = [("stage", stage.name())];

@@ -1,16 +1,6 @@
 //! Values of labels.
 
-use crate::schedule::{Expired, FailClass, JobState};
-
-pub fn state(state: JobState) -> &'static str {
-    match state {
-        JobState::Running => "running",
-        JobState::Paused => "paused",
-        JobState::Succeeded => "succeeded",
-        JobState::Failed => "failed",
-        JobState::Cancelled => "cancelled",
-    }
-}
+use crate::schedule::{Expired, FailClass};
 
 pub fn class(class: FailClass) -> &'static str {
     match class {

@@ -50,7 +50,9 @@ pub enum StoreError {
     #[error(transparent)]
     Refused(#[from] Refusal),
     /// A damaged row.
-    #[error("the store is damaged: {tree}: {message}; restore the data directory from a backup")]
+    #[error(
+        "the store is damaged: {tree}: {message}; restore the data directory from a backup, or the database if it has the jobs"
+    )]
     Corrupt {
         /// The tree.
         tree: &'static str,

@@ -9,8 +9,7 @@ use super::super::record::{decode, encode};
 use super::super::{JobFilter, JobView, Levels, NewJob, StoreError, StoredEvent, request_key};
 use super::locks::{self, Held};
 use super::rows::{
-    EventColumns, TaskColumns, job_state, parse_job, parse_job_state, read_job, read_tasks, stages, task_of,
-    write_job,
+    EventColumns, TaskColumns, parse_job, parse_job_state, read_job, read_tasks, stages, task_of, write_job,
 };
 use super::tenants::{parse, quota_of, usage_of};
 use super::{Inner, begin_reading, datasets, leases, unavailable, whole};
@@ -106,7 +105,7 @@ pub async fn list(
     before: Option<&JobId>,
     limit: usize,
 ) -> Result<Vec<JobRecord>, StoreError> {
-    let states: Vec<&str> = filter.states.iter().map(|state| job_state(*state)).collect();
+    let states: Vec<&str> = filter.states.iter().map(|state| state.name()).collect();
     let mut before = before.cloned();
     let mut found = Vec::new();
     while found.len() < limit {

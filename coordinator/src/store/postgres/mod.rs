@@ -1,4 +1,4 @@
-//! The store for several machines, in PostgreSQL 14 or later.
+//! The store for several machines, in PostgreSQL.
 //!
 //! | module | content |
 //! |---|---|

@@ -26,7 +26,9 @@ const TAKE_OVER_WITHIN: Duration = Duration::from_secs(30);
 const ONE_COORDINATOR: i64 = 0x6661_7468_6f6d;
 /// The database itself ends what takes longer, so that a coordinator behind a cut network holds no lock.
 /// The same for connections whose client has gone without a word.
-const SESSION: [(&str, &str); 8] = [
+const SESSION: [(&str, &str); 9] = [
+    // Whatever the server's default is: what is acknowledged must be on its disk.
+    ("synchronous_commit", "on"),
     // The same reason as for the columns of `tasks`: an index is never wrong by much.
     ("enable_seqscan", "off"),
     ("tcp_keepalives_idle", "10"),
@@ -121,14 +123,21 @@ impl PostgresStore {
     /// # Errors
     /// When another one has it, or the database cannot be reached.
     pub async fn hold_alone(&self, with: File) -> Result<(), StoreError> {
-        let begin = Instant::now();
+        let mut waits_since = None;
         let held = loop {
-            match lock_alone(&self.0.connect).await? {
-                Some(held) => break held,
-                // The database may not have noticed yet that a killed one is gone.
-                None if begin.elapsed() < TAKE_OVER_WITHIN => tokio::time::sleep(WATCH_EVERY / 10).await,
-                None => return Err(StoreError::DatabaseInUse),
+            if let Some(held) = lock_alone(&self.0.connect).await? {
+                break held;
             }
+            // The database may not have noticed yet that a killed one is gone.
+            let since = *waits_since.get_or_insert_with(|| {
+                let seconds = TAKE_OVER_WITHIN.as_secs();
+                tracing::warn!(seconds, "the database has another coordinator; waiting for it to leave");
+                Instant::now()
+            });
+            if since.elapsed() > TAKE_OVER_WITHIN {
+                return Err(StoreError::DatabaseInUse);
+            }
+            tokio::time::sleep(WATCH_EVERY / 10).await;
         };
         let watch = tokio::spawn(watch_alone(Arc::downgrade(&self.0), held, with));
         // Once only: a store is opened for one coordinator.
@@ -205,6 +214,25 @@ async fn watch_alone(store: Weak<Inner>, mut held: PgConnection, _with: File) {
             }
             // The database is not available; calls report it.
             Ok(Err(_)) | Err(_) => {}
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::super::conformance::postgres_server::database;
+    use super::*;
+
+    #[tokio::test]
+    async fn commits_wait_for_the_disk_whatever_the_url_says() {
+        let Some(url) = database() else { return };
+        let url = format!("{url}&options=-c%20synchronous_commit=off");
+        let options =
+            PostgresOptions { url, rules: Rules::default(), lease_ms: 1000, stall_ms: 0, connections: 2 };
+        let store = PostgresStore::open(&options).await.unwrap();
+        for (pool, expected) in [(&store.0.pool, "on"), (&store.0.renewals, "off")] {
+            let set: String = sqlx::query_scalar("SHOW synchronous_commit").fetch_one(pool).await.unwrap();
+            assert_eq!(set, expected);
         }
     }
 }

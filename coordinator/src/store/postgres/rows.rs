@@ -44,21 +44,9 @@ pub fn number(value: u64) -> i64 {
     i64::try_from(value).unwrap_or(i64::MAX)
 }
 
-pub fn job_state(state: JobState) -> &'static str {
-    match state {
-        JobState::Running => "running",
-        JobState::Paused => "paused",
-        JobState::Succeeded => "succeeded",
-        JobState::Failed => "failed",
-        JobState::Cancelled => "cancelled",
-    }
-}
-
 /// The state of a `state` column.
 pub fn parse_job_state(text: &str) -> Result<JobState, StoreError> {
-    let all =
-        [JobState::Running, JobState::Paused, JobState::Succeeded, JobState::Failed, JobState::Cancelled];
-    let found = all.into_iter().find(|state| job_state(*state) == text);
+    let found = JobState::ALL.into_iter().find(|state| state.name() == text);
     found.ok_or_else(|| StoreError::Corrupt { tree: "jobs", message: format!("the state {text:?}") })
 }
 
@@ -200,7 +188,7 @@ pub async fn write_job(conn: &mut PgConnection, job: &JobRecord) -> Result<(), S
          ON CONFLICT (job_id) DO UPDATE SET state = excluded.state, priority = excluded.priority, \
          max_parallel = excluded.max_parallel, leased = excluded.leased, row = excluded.row",
     );
-    let write = write.bind(job.job_id.as_str()).bind(job.tenant.as_str()).bind(job_state(job.state));
+    let write = write.bind(job.job_id.as_str()).bind(job.tenant.as_str()).bind(job.state.name());
     let write = write.bind(job.priority).bind(i64::from(job.max_parallel)).bind(i64::from(job.leased_tasks));
     let write = write.bind(job.dataset.as_ref().map(|dataset| dataset.as_str().to_owned()));
     write.bind(encode("jobs", job)?).execute(conn).await.map_err(unavailable)?;

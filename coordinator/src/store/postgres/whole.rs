@@ -7,7 +7,7 @@ use sqlx::{Connection, PgConnection};
 use super::super::export::{Export, JobExport};
 use super::super::record::{decode, encode};
 use super::super::{StoreError, StoredEvent, WorkerMark, request_key};
-use super::rows::{EventColumns, LeaseColumns, TaskColumns, job_state, number, parse_job, write_job};
+use super::rows::{EventColumns, LeaseColumns, TaskColumns, number, parse_job, write_job};
 use super::{begin_reading, datasets, tenants, unavailable};
 use crate::schedule::{JobId, TaskRecord};
 
@@ -224,7 +224,7 @@ async fn index_faults(conn: &mut PgConnection, export: &Export) -> Result<Vec<St
             faults.push(format!("job {id}: its request does not lead to it"));
         }
         let wanted =
-            (job.tenant.as_str().to_owned(), job_state(job.state).to_owned(), i64::from(job.leased_tasks));
+            (job.tenant.as_str().to_owned(), job.state.name().to_owned(), i64::from(job.leased_tasks));
         if columns.get(id) != Some(&wanted) {
             faults.push(format!("job {id}: its columns differ from its row"));
         }
