@@ -25,6 +25,7 @@ test: ## every test; those that need a GPU run on Mesa's CPU driver, those of a 
 check: ## formatting, lints, scripts, documentation, shaders, protos, tidiness; CI runs this before the tests
 	@cargo fmt --all --check
 	scripts/shellcheck.sh
+	scripts/charts.py
 	cargo clippy --workspace --all-targets -- -D warnings
 	RUSTDOCFLAGS="-D warnings" cargo doc --workspace --no-deps
 	cargo test --workspace --test shaders_validate --test languages --test compatible --test tidy

@@ -20,6 +20,10 @@ pub struct CoordinatorConfig {
     pub store: Option<String>,
     /// Maximum connections to that database. Default 32, at least 2.
     pub store_connections: u32,
+    /// URL of the place of photographs, checkpoints and results: `s3://BUCKET/PREFIX`, `gs://BUCKET/PREFIX`,
+    /// `az://CONTAINER/PREFIX` or `file:///FOLDER`. Keys come from the environment variables of the provider,
+    /// or from the role of the machine. Default none: `data_dir`.
+    pub objects: Option<String>,
     /// Where to listen; port 0 takes a free one. Default 127.0.0.1:7420.
     pub listen: SocketAddr,
     /// Where to serve metrics and health over HTTP, neither encrypted nor authenticated; port 0 takes a free
@@ -95,6 +99,7 @@ impl Default for CoordinatorConfig {
             data_dir: PathBuf::from("fathom-data"),
             store: None,
             store_connections: 32,
+            objects: None,
             listen: SocketAddr::from((Ipv4Addr::LOCALHOST, 7420)),
             metrics_listen: None,
             scaler_listen: None,

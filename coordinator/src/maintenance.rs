@@ -4,9 +4,12 @@
 //! Read-only operations open a copy of the store of a data directory in a separate folder. The original stays
 //! unchanged to the byte, and may be on a disk that is read-only or full.
 
+mod moving;
+
 use std::collections::BTreeSet;
 use std::fmt;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use fathom_core::scene::{BlobRef, Manifest};
 
@@ -15,7 +18,7 @@ use crate::clock::Clock;
 use crate::data_dir;
 use crate::datasets::{DatasetRecord, FileList};
 use crate::error::CoordinatorError;
-use crate::objects::{BlobStore, ObjectError, TenantBlobs};
+use crate::objects::{BlobStore, ObjectError, ObjectsAt, TenantBlobs};
 use crate::own_tasks::artifacts::ArtifactIndex;
 use crate::references::{Reference, references};
 use crate::schedule::{Artifact, Rules, Tenant};
@@ -25,6 +28,8 @@ use crate::store::{
     verify,
 };
 
+pub use moving::{Moved, move_service};
+
 /// Where the rows and the files of jobs are.
 #[derive(Clone, Debug)]
 pub struct Place {
@@ -32,6 +37,8 @@ pub struct Place {
     pub data_dir: PathBuf,
     /// URL of the database that has its jobs; `None`: they are in `data_dir`.
     pub store: Option<String>,
+    /// URL of the bucket or folder that has its files; `None`: they are in `data_dir`.
+    pub objects: Option<String>,
 }
 
 /// The database without its URL, which may contain a password; or the data directory.
@@ -100,7 +107,6 @@ pub async fn export(place: &Place, scratch: Option<&Path>, file: &Path) -> Resul
 /// When there is a store already, the database cannot be reached, the file is damaged, or its content
 /// violates the rules. Nothing is left behind then.
 pub async fn import(file: &Path, place: &Place) -> Result<Counts, CoordinatorError> {
-    let refuse = |message: String| Err(CoordinatorError::Maintenance(message));
     if let Some(url) = &place.store {
         let export = sound_export(file)?;
         let store = open_database(url).await?;
@@ -108,12 +114,20 @@ pub async fn import(file: &Path, place: &Place) -> Result<Counts, CoordinatorErr
         store.close().await;
         return Ok(Counts::of(&export));
     }
-    let data_dir = place.data_dir.as_path();
+    let export = sound_export(file)?;
+    import_into_folder(&export, &place.data_dir).await?;
+    Ok(Counts::of(&export))
+}
+
+/// Creates the store of a data directory, which must have none.
+async fn import_into_folder(export: &Export, data_dir: &Path) -> Result<(), CoordinatorError> {
     let (store, staged) = (data_dir.join("store"), data_dir.join("store.importing"));
     if store.exists() {
-        return refuse(format!("{} already exists; import into a new data directory", store.display()));
+        return Err(CoordinatorError::Maintenance(format!(
+            "{} already exists; import into a new data directory",
+            store.display()
+        )));
     }
-    let export = sound_export(file)?;
     let failed =
         |error: std::io::Error| CoordinatorError::Maintenance(format!("{}: {error}", staged.display()));
     if staged.exists() {
@@ -122,10 +136,9 @@ pub async fn import(file: &Path, place: &Place) -> Result<Counts, CoordinatorErr
     }
     data_dir::make(data_dir)?;
     let imported = SledStore::open(&options(&staged))?;
-    imported.import(&export).await?;
+    imported.import(export).await?;
     drop(imported);
-    std::fs::rename(&staged, &store).and_then(|()| sync_folder(data_dir)).map_err(failed)?;
-    Ok(Counts::of(&export))
+    std::fs::rename(&staged, &store).and_then(|()| sync_folder(data_dir)).map_err(failed)
 }
 
 /// An export without faults.
@@ -201,6 +214,7 @@ pub fn keep_backup(backup: &[u8], file: &Path) -> Result<Counts, CoordinatorErro
 /// cannot be written.
 pub async fn verify(place: &Place, scratch: Option<&Path>, deep: bool) -> Result<Verified, CoordinatorError> {
     let data_dir = place.data_dir.as_path();
+    let at = ObjectsAt::parse(place.objects.as_deref(), data_dir)?;
     let (export, mut faults) = match &place.store {
         Some(url) => open_database(url).await?.verified().await?,
         None => {
@@ -218,23 +232,20 @@ pub async fn verify(place: &Place, scratch: Option<&Path>, deep: bool) -> Result
     for tenant in tenants {
         let jobs: Vec<&JobExport> = export.jobs.iter().filter(|job| job.job.tenant == *tenant).collect();
         let datasets: Vec<&DatasetRecord> = committed().filter(|dataset| dataset.tenant == *tenant).collect();
-        let folder = TenantBlobs::folder(data_dir, tenant);
-        if !folder.is_dir() {
-            let fault = format!(
-                "{} does not exist, so all files of {tenant}'s jobs and datasets are missing",
-                folder.display()
-            );
+        let Some(objects) = TenantBlobs::existing(&at, tenant)? else {
+            let fault =
+                format!("{tenant} has no folder of files, so all files of its jobs and datasets are missing");
             verified.faults.push(fault);
             continue;
-        }
-        verify_blobs(&BlobStore::existing(&folder)?, &jobs, &datasets, deep, &mut verified).await?;
+        };
+        verify_blobs(&Arc::new(objects), &jobs, &datasets, deep, &mut verified).await?;
     }
     Ok(verified)
 }
 
 /// Verifies the blobs that the jobs and datasets of one tenant reference.
 async fn verify_blobs(
-    objects: &BlobStore,
+    objects: &Arc<BlobStore>,
     jobs: &[&JobExport],
     datasets: &[&DatasetRecord],
     deep: bool,
@@ -291,7 +302,7 @@ async fn verify_blobs(
 
 /// Blobs to verify, each once.
 struct Blobs<'a> {
-    objects: &'a BlobStore,
+    objects: &'a Arc<BlobStore>,
     deep: bool,
     seen: BTreeSet<String>,
     bytes: u64,
@@ -312,19 +323,11 @@ impl Blobs<'_> {
             Err(error) => return Err(error.into()),
         };
         let found = match found {
-            None if self.deep => {
-                let path = self.objects.local_path(blob)?;
-                let digest = tokio::task::spawn_blocking(move || {
-                    let mut hasher = blake3::Hasher::new();
-                    hasher.update_reader(std::fs::File::open(&path)?)?;
-                    Ok::<_, std::io::Error>(hasher.finalize().to_hex().to_string())
-                });
-                match digest.await.map_err(|error| CoordinatorError::Maintenance(error.to_string()))? {
-                    Ok(digest) if digest == blob.digest => None,
-                    Ok(digest) => Some(format!("has other content: its digest is {digest}")),
-                    Err(error) => Some(format!("cannot be read: {error}")),
-                }
-            }
+            None if self.deep => match self.objects.digest_of(blob).await {
+                Ok(digest) if digest == blob.digest => None,
+                Ok(digest) => Some(format!("has other content: its digest is {digest}")),
+                Err(error) => Some(format!("cannot be read: {error}")),
+            },
             found => found,
         };
         self.faults.extend(found.map(|fault| format!("{what} {fault} (blob {})", blob.digest)));

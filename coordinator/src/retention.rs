@@ -94,10 +94,9 @@ pub async fn collect(shared: &State, policy: Policy) -> Result<Removed, Retentio
     let before = shared.clock.system_time().checked_sub(policy.unused).unwrap_or(SystemTime::UNIX_EPOCH);
     let mut used = used(shared).await?;
     let mut removed = Removed::default();
-    for (tenant, objects) in shared.objects.all()? {
+    for (tenant, objects) in shared.objects.all().await? {
         let used = used.remove(&tenant).unwrap_or_default();
-        let of_tenant = threads::blocking(move || objects.remove_unused(before, &used));
-        removed = removed.and(of_tenant.await.map_err(std::io::Error::other)??);
+        removed = removed.and(objects.remove_unused(before, used).await?);
     }
     shared.metrics.removed(&removed);
     if removed != Removed::default() || forgotten > 0 {
@@ -213,7 +212,7 @@ impl Used<'_> {
         tenant: &Tenant,
         references: impl IntoIterator<Item = Reference<'b>>,
     ) -> Result<(), RetentionError> {
-        let objects = self.shared.objects.of(tenant)?;
+        let objects = self.shared.objects.of(tenant).await?;
         let used = self.by_tenant.entry(tenant.clone()).or_default();
         for Reference { what, blob, names_others } in references {
             used.insert(blob.digest.clone());

@@ -33,7 +33,7 @@ use crate::metrics::Metrics;
 use crate::metrics::endpoint::Endpoint;
 use crate::metrics::rpc::RpcLayer;
 use crate::metrics::store::CountedStore;
-use crate::objects::{Removed, TenantBlobs};
+use crate::objects::{ObjectsAt, Removed, TenantBlobs};
 use crate::own_tasks::run_own_tasks;
 use crate::rate_limited_log::RateLimitedLog;
 use crate::retention::{Housekeeping, Policy, RetentionError, collect, collect_garbage};
@@ -158,8 +158,10 @@ pub async fn serve(config: CoordinatorConfig) -> Result<Coordinator, Coordinator
     };
     let clock = Clock::start();
     data_dir::make(&config.data_dir)?;
-    let objects = TenantBlobs::open(&config.data_dir, config.min_free_bytes, clock)?;
+    let at = ObjectsAt::parse(config.objects.as_deref(), &config.data_dir)?;
     let store = open_store(&config).await?;
+    at.hold_for(&store.deployment().await?).await?;
+    let objects = TenantBlobs::open(at, &config.data_dir, config.min_free_bytes, clock).await?;
     let house = config.housekeeping();
     let room = Room::of_this_process();
     let mut coordinator =
@@ -180,7 +182,7 @@ async fn open_store(config: &CoordinatorConfig) -> Result<Arc<dyn Store>, Coordi
         let options = PostgresOptions { url: url.clone(), rules, lease_ms, stall_ms, connections };
         let held = data_dir::hold_for_database(&config.data_dir, &options.place()?)?;
         let store = PostgresStore::open(&options).await?;
-        store.hold_alone(held).await?;
+        store.hold_alone(Some(held)).await?;
         return Ok(Arc::new(store));
     }
     data_dir::refuse_if_of_database(&config.data_dir)?;
@@ -208,7 +210,8 @@ where
     C: AsyncRead + AsyncWrite + Connected + Unpin + Send + 'static,
 {
     let tls = tls_of(&config)?;
-    let objects = TenantBlobs::open(&config.data_dir, config.min_free_bytes, clock)?;
+    let at = ObjectsAt::Folder(config.data_dir.clone());
+    let objects = TenantBlobs::open(at, &config.data_dir, config.min_free_bytes, clock).await?;
     let incoming = incoming.filter_map(|accepted| std::future::ready(accepted.ok().map(|io| (io, None))));
     let room = Room::of_descriptors(None);
     start(config, tls, objects, Arc::new(store), clock, house, None, room, incoming).await
@@ -242,7 +245,7 @@ where
     let scheme = if tls.is_some() { "https" } else { "http" };
     let metrics_address = for_metrics.as_ref().map(|(_, address)| *address);
     store.recover(clock.now_ms()).await?;
-    for (_, objects) in objects.all()? {
+    for (_, objects) in objects.all().await? {
         objects.discard_staged()?;
     }
     let marks = store.worker_marks().await?.into_iter().collect();

@@ -289,7 +289,16 @@ impl From<ServiceError> for Status {
                 ObjectError::Busy(_) => (Code::Aborted, "WRITE_IN_PROGRESS"),
                 ObjectError::OverLimit { .. } => (Code::ResourceExhausted, "QUOTA_SPENT"),
                 ObjectError::LowSpace { .. } => (Code::ResourceExhausted, "LOW_DISK_SPACE"),
-                ObjectError::Io { .. } | ObjectError::Store(_) => {
+                ObjectError::Unavailable(_) => {
+                    // Clients must not learn names of buckets.
+                    tracing::warn!(%error, "a request to the object store failed");
+                    message = "the coordinator's object store is not available; try again".into();
+                    (Code::Unavailable, "STORE_UNAVAILABLE")
+                }
+                ObjectError::Io { .. }
+                | ObjectError::Store(_)
+                | ObjectError::BadUrl { .. }
+                | ObjectError::OfOther { .. } => {
                     // Clients must not learn paths of this machine.
                     tracing::warn!(%error, "cannot read or write a blob");
                     if error.is_full() {

@@ -66,7 +66,7 @@ impl State {
 
     /// Refuses if `more` bytes would exceed the tenant's quota.
     pub async fn check_bytes(&self, tenant: &Tenant, more: u64) -> Result<(), ServiceError> {
-        let used_bytes = self.objects.used_bytes(tenant)?;
+        let used_bytes = self.objects.used_bytes(tenant).await?;
         match self.limit_bytes(tenant).await? {
             Some(limit_bytes) if used_bytes.saturating_add(more) > limit_bytes => {
                 Err(ServiceError::TooManyBytes { tenant: tenant.clone(), used_bytes, limit_bytes })

@@ -22,6 +22,8 @@ mod postgres;
 #[path = "../support/processes.rs"]
 mod processes;
 mod render;
+#[path = "../support/s3.rs"]
+mod s3;
 #[cfg(unix)]
 mod several_machines;
 #[cfg(unix)]

@@ -1,8 +1,9 @@
 //! `fathom store`: a data directory is exported, checked, damaged, and restored from its export.
 
 use std::path::{Path, PathBuf};
+use std::process::{Output, Stdio};
 
-use crate::processes::{Service, fail, free_port, json, succeed, tiny_scene, under};
+use crate::processes::{Service, fail, free_port, json, output_in, succeed, tiny_scene, under};
 
 /// The largest object file of a data directory.
 fn largest_object(data: &Path) -> PathBuf {
@@ -127,4 +128,72 @@ fn a_service_moves_to_a_database_and_back() {
     succeed(&["store", "import", &back, "--data-dir", &data]);
     std::fs::remove_file(at("data/database.lock")).expect("its file");
     assert_eq!(submit(&[]), job, "a repeated request made another job");
+}
+
+#[test]
+fn a_service_moves_to_a_database_and_a_bucket_and_back() {
+    let Some(database) = crate::postgres::database() else { return };
+    let bucket = crate::s3::S3Server::start();
+    let (keys, objects) = (bucket.environment(), bucket.url("scenes"));
+    let folder = tempfile::tempdir().expect("a folder");
+    let at = |name: &str| under(folder.path(), name);
+    let (data, away, back) = (at("data"), at("away"), at("back"));
+    let scene = tiny_scene(folder.path());
+    let with_keys = |words: &[&str]| {
+        let Output { status, stdout, stderr } = output_in(&keys, words);
+        let said = String::from_utf8_lossy(&stderr).into_owned();
+        (status.success(), String::from_utf8(stdout).expect("text") + &said)
+    };
+    let moved = |words: &[&str]| {
+        let (succeeded, said) = with_keys(&[&["store", "move", "--json"], words].concat());
+        assert!(succeeded, "{said}");
+        let moved: serde_json::Value = serde_json::from_str(&said).expect("JSON");
+        assert_eq!((&moved["jobs"], &moved["faults"]), (&1.into(), &serde_json::json!([])), "{moved}");
+        moved["copied_blobs"].as_u64().expect("a number")
+    };
+    // The same request at each coordinator: it makes one job.
+    let submit = |flags: &[&str]| {
+        let flags = [&["coordinator", "--listen", "127.0.0.1:0"], flags].concat();
+        let keys = keys.each_ref().map(|(name, value)| (*name, value.as_str()));
+        let mut service = Service::with_environment(&flags, Stdio::piped(), Stdio::inherit(), &keys);
+        let url = service.wait_until_it_listens();
+        let words = ["submit", &scene, "--coordinator", &url, "--iterations=50", "--request-id=once"];
+        succeed(&words).trim().to_owned()
+    };
+    let job = submit(&["--data-dir", &data]);
+    std::fs::create_dir_all(at("data/logs/of-a-job")).expect("a folder");
+    std::fs::write(at("data/logs/of-a-job/line"), "a line").expect("written");
+
+    let to = ["--to-data-dir", &away, "--to-store", &database, "--to-objects", &objects];
+    assert!(moved(&[&["--data-dir", &data], &to[..]].concat()) > 64);
+    assert_eq!(
+        moved(&[&["--data-dir", &data], &to[..]].concat()),
+        0,
+        "a second move copies everything again"
+    );
+    assert_eq!(std::fs::read_to_string(at("away/logs/of-a-job/line")).expect("the log"), "a line");
+    assert!(!Path::new(&at("away/objects/cas")).exists(), "files are in the bucket");
+    let there = ["--data-dir", &away, "--store", &database, "--objects", &objects];
+    let (succeeded, said) = with_keys(&[&["store", "verify", "--deep"], &there[..]].concat());
+    assert!(succeeded, "{said}");
+    assert_eq!(submit(&there), job, "a repeated request made another job");
+
+    // A coordinator of other jobs would delete these files.
+    let other = at("other");
+    let (succeeded, said) =
+        with_keys(&["coordinator", "--data-dir", &other, "--objects", &objects, "--listen=127.0.0.1:0"]);
+    assert!(!succeeded && said.contains("the files of another deployment"), "{said}");
+    // Without the right keys, and with a wrong URL.
+    let wrong = keys.each_ref().map(|(name, value)| {
+        (*name, if name.contains("SECRET") { "wrong".to_owned() } else { value.clone() })
+    });
+    let refused = output_in(&wrong, &[&["store", "verify"], &there[..]].concat());
+    let said = String::from_utf8_lossy(&refused.stderr).into_owned();
+    assert!(!refused.status.success() && said.contains("object store is not available"), "{said}");
+    let (_, said) = fail(&["coordinator", "--data-dir", &other, "--objects=reef", "--listen=127.0.0.1:0"]);
+    assert!(said.contains("objects = \"reef\""), "{said}");
+
+    moved(&[&there[..], &["--to-data-dir", &back]].concat());
+    assert_eq!(submit(&["--data-dir", &back]), job, "a repeated request made another job");
+    succeed(&["store", "verify", "--data-dir", &back, "--deep"]);
 }

@@ -1,9 +1,10 @@
-//! Killed databases, and coordinators whose jobs are in one.
+//! Killed databases, buckets that fail, and coordinators whose jobs and files are in them.
 
 use std::time::Duration;
 
 use crate::harness::Harness;
 use crate::processes::can_train;
+use crate::s3::Fault;
 
 #[test]
 fn a_database_killed_twice_in_a_job_costs_no_task() {
@@ -26,6 +27,32 @@ fn a_database_killed_twice_in_a_job_costs_no_task() {
     for said in ["the database is not available; calls are refused", "the database is available again"] {
         assert!(log.contains(said), "{said}: {log}");
     }
+    harness.check_data_dir();
+}
+
+#[test]
+fn a_bucket_that_fails_costs_no_task() {
+    let scenario = "a_bucket_that_fails_costs_no_task";
+    if !can_train(scenario) {
+        return;
+    }
+    let Some(mut harness) = Harness::on_database(scenario) else { return };
+    harness.start_worker("first");
+    let job = harness.submit();
+    job.wait_for_checkpoint("partition-0000");
+    let lease = Duration::from_millis(harness.rules.lease_ms);
+    // For as long as a coordinator tries a request, and longer.
+    harness.bucket().break_every(1, Some(Fault::Status(503)));
+    std::thread::sleep(lease * 4);
+    // To the end of the job, and while its model is fetched, every third request fails.
+    harness.bucket().break_every(3, Some(Fault::Status(500)));
+    job.wait_for_checkpoint("partition-0001");
+    harness.bucket().break_every(3, Some(Fault::Truncated));
+    let history = harness.succeeded(&job);
+    harness.bucket().break_every(3, None);
+    assert_eq!(history.losses(), 0, "a live worker was counted as lost\n{history}");
+    let (requests, faults) = harness.bucket().requests();
+    println!("{faults} of {requests} requests to the bucket failed");
     harness.check_data_dir();
 }
 

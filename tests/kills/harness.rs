@@ -11,12 +11,16 @@ use serde_json::Value;
 use crate::history::{Acknowledged, History};
 use crate::postgres::{Disk, Server};
 use crate::process::{Process, Random};
-use crate::processes::{free_port, output_of, under};
+use crate::processes::{free_port, output_in, output_of, under};
 use crate::reference;
+use crate::s3::S3Server;
 use crate::small_disk::wait_for;
 
 /// Number of lines of each log shown on a failure.
 const LAST_LINES: usize = 14;
+
+/// Where files are in a bucket.
+const PREFIX: &str = "scenes";
 
 /// Settings that differ between scenarios.
 #[derive(Clone)]
@@ -46,6 +50,8 @@ pub struct Harness {
     coordinator: Option<Process>,
     /// The database of its jobs, and its URL; without one, they are in the data directory.
     database: Option<(Server, String)>,
+    /// The server of its files; without one, they are in the data directory.
+    bucket: Option<S3Server>,
     workers: BTreeMap<String, Process>,
     jobs: Vec<String>,
     /// Killed processes.
@@ -78,13 +84,15 @@ impl Harness {
         harness
     }
 
-    /// The same with its jobs in a database of its own; `None` where PostgreSQL is missing.
+    /// The same with its jobs in a database of its own and its files in a bucket; `None` where PostgreSQL is
+    /// missing.
     pub fn on_database(scenario: &'static str) -> Option<Self> {
         let server = Server::start(Disk::Synced)?;
         let url = server.database();
         // Longer than a pool takes to connect again.
         let mut harness = Self::stopped(scenario, Rules { lease_ms: 3000, ..Rules::default() });
         harness.database = Some((server, url));
+        harness.bucket = Some(S3Server::start());
         harness.start_coordinator();
         Some(harness)
     }
@@ -103,6 +111,7 @@ impl Harness {
             rules,
             coordinator: None,
             database: None,
+            bucket: None,
             workers: BTreeMap::new(),
             jobs: Vec::new(),
             kills: 0,
@@ -148,7 +157,9 @@ impl Harness {
             format!("--min-free-bytes={min_free_bytes}"),
         ];
         arguments.extend(self.database.as_ref().map(|(_, url)| format!("--store={url}")));
-        let mut process = Process::start("coordinator", &arguments, &self.log_folder());
+        arguments.extend(self.bucket.as_ref().map(|bucket| format!("--objects={}", bucket.url(PREFIX))));
+        let mut process =
+            Process::start_in("coordinator", &arguments, &self.environment(), &self.log_folder());
         let ready = process.line().is_some_and(|line| line.starts_with("listening on http://"));
         self.coordinator = Some(process);
         ready
@@ -163,8 +174,18 @@ impl Harness {
         self.kills += 1;
     }
 
+    /// Variables that the coordinator needs for its bucket.
+    fn environment(&self) -> Vec<(&'static str, String)> {
+        self.bucket.iter().flat_map(S3Server::environment).collect()
+    }
+
     pub fn has_database(&self) -> bool {
         self.database.is_some()
+    }
+
+    /// The server of its files.
+    pub fn bucket(&self) -> &S3Server {
+        self.bucket.as_ref().expect("a bucket")
     }
 
     /// Kills the database server, and starts it again after `pause`.
@@ -339,7 +360,9 @@ impl Harness {
         if let Some((_, url)) = &self.database {
             verify.extend(["--store", url]);
         }
-        let found = output_of(&verify);
+        let objects = self.bucket.as_ref().map(|bucket| format!("--objects={}", bucket.url(PREFIX)));
+        verify.extend(objects.as_deref());
+        let found = output_in(&self.environment(), &verify);
         let said = String::from_utf8_lossy(&found.stdout).into_owned();
         assert!(found.status.success(), "the coordinator left damaged data: {said}");
     }

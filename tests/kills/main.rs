@@ -23,6 +23,8 @@ mod harness;
 mod history;
 mod process;
 mod reference;
+#[path = "../support/s3.rs"]
+mod s3;
 mod slow_link;
 #[path = "../support/small_disk.rs"]
 mod small_disk;

@@ -21,11 +21,17 @@ pub struct Process {
 impl Process {
     /// Starts it; appends its log to `logs`/`name`.log.
     pub fn start(name: &str, arguments: &[String], logs: &Path) -> Self {
+        Self::start_in(name, arguments, &[], logs)
+    }
+
+    /// The same with more variables in its environment.
+    pub fn start_in(name: &str, arguments: &[String], environment: &[(&str, String)], logs: &Path) -> Self {
         let log = logs.join(format!("{name}.log"));
         let file = File::options().create(true).append(true).open(&log).expect("a log");
         let mut child = fathom(arguments)
             .env("FATHOM_LOG", "info")
             .env("NO_COLOR", "1")
+            .envs(environment.iter().map(|(name, value)| (name, value)))
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
             .stderr(file)

@@ -7,6 +7,7 @@ use crate::harness::{Harness, Job};
 use crate::history::History;
 use crate::processes::can_train;
 use crate::reference::scene;
+use crate::s3::Fault;
 
 /// Number of faults per job; after them it runs undisturbed and must finish.
 const FAULTS: u64 = 8;
@@ -46,6 +47,8 @@ fn rounds() -> u32 {
 struct Figures {
     coordinators: u32,
     databases: u32,
+    /// Times in which requests to the bucket failed.
+    buckets: u32,
     workers: u32,
     stopped: u32,
     asked_to_leave: u32,
@@ -147,6 +150,10 @@ impl Chaos {
             self.disturbed.push(Instant::now());
             return;
         }
+        if self.harness.has_database() && self.harness.random.below(4) == 0 {
+            self.break_bucket();
+            return;
+        }
         match self.harness.random.below(10) {
             0..4 => self.kill_coordinator(),
             4..7 => self.kill_worker(),
@@ -173,6 +180,20 @@ impl Chaos {
                 self.figures.asked_to_leave += 1;
             }
         }
+    }
+
+    /// Requests to the bucket fail, in one of the ways of real ones, and then no more.
+    fn break_bucket(&mut self) {
+        let slow = Fault::Slow(Duration::from_millis(500));
+        let faults = [Fault::Status(500), Fault::Status(503), Fault::Truncated, slow];
+        let fault = faults[self.harness.random.below(4) as usize];
+        let every = 1 + self.harness.random.below(3);
+        self.disturbed.push(Instant::now());
+        self.harness.bucket().break_every(every, Some(fault));
+        self.harness.random.sleep(0, 3000);
+        self.harness.bucket().break_every(every, None);
+        self.disturbed.push(Instant::now());
+        self.figures.buckets += 1;
     }
 
     fn kill_coordinator(&mut self) {
@@ -229,10 +250,10 @@ impl Chaos {
 
 impl Figures {
     fn said(&self) -> String {
-        let Self { coordinators, databases, workers, stopped, asked_to_leave, events, .. } = self;
+        let Self { coordinators, databases, buckets, workers, stopped, asked_to_leave, events, .. } = self;
         format!(
             "coordinators {coordinators}, databases {databases}, workers {workers}; {stopped} processes stopped, {asked_to_leave} \
-             workers asked to leave; {events} events of tasks without a gap, and no acknowledgement lost\n\
+             workers asked to leave, {buckets} faults of the bucket; {events} events of tasks without a gap, and no acknowledgement lost\n\
              coordinator from start to ready, ms: {}\nlease taken back after a worker's kill, leases: {}\n\
              task given to another worker, leases: {}\nwork lost by a kill, seconds: {}; iterations: {}",
             spread(&self.restarts),

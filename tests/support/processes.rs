@@ -51,7 +51,14 @@ impl Watchdog {
 
 /// Runs it to its end, with any result.
 pub fn output_of<S: AsRef<str>>(arguments: &[S]) -> Output {
-    let child = fathom(arguments).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn();
+    output_in(&[], arguments)
+}
+
+/// The same with more variables in its environment.
+pub fn output_in<S: AsRef<str>>(environment: &[(&str, String)], arguments: &[S]) -> Output {
+    let mut command = fathom(arguments);
+    command.envs(environment.iter().map(|(name, value)| (name, value)));
+    let child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn();
     let child = child.expect("the binary starts");
     let _watchdog = Watchdog::over(&child);
     child.wait_with_output().expect("its output")

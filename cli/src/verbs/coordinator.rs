@@ -43,6 +43,11 @@ pub struct CoordinatorSettings {
     /// Maximum connections to that database, at least 2
     #[arg(long, value_name = "N", env = "FATHOM_STORE_CONNECTIONS")]
     store_connections: Option<u32>,
+    /// Bucket or folder for photographs, checkpoints and results: s3://BUCKET/PREFIX, gs://BUCKET/PREFIX,
+    /// az://CONTAINER/PREFIX or file:///FOLDER; give keys in the environment variables of the provider, such
+    /// as AWS_ACCESS_KEY_ID [default: the data folder]
+    #[arg(long, value_name = "URL", env = "FATHOM_OBJECTS")]
+    objects: Option<String>,
     /// Address or host name to listen on; beyond this machine it needs TLS and tokens; port 0 takes a free
     /// one
     #[arg(long, value_name = "ADDRESS:PORT", env = "FATHOM_LISTEN", value_parser = super::parse_address)]

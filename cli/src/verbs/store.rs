@@ -4,7 +4,7 @@
 use std::path::PathBuf;
 
 use clap::{Args, Subcommand};
-use fathom_coordinator::maintenance::{self, Counts, Place};
+use fathom_coordinator::maintenance::{self, Counts, Moved, Place};
 use serde_json::json;
 
 use super::ServiceArgs;
@@ -51,10 +51,31 @@ enum What {
         #[command(flatten)]
         data: DataDir,
     },
+    /// Copy jobs, files and logs of a stopped coordinator to another data directory, database or bucket, and
+    /// verify them there. What it copied stays when it is interrupted, and the next move goes on from there
+    Move {
+        #[command(flatten)]
+        data: DataDir,
+        #[command(flatten)]
+        files: ObjectsArg,
+        #[command(flatten)]
+        copy: CopyArgs,
+        /// Data directory of the new coordinator [default: the same]
+        #[arg(long, value_name = "DIR")]
+        to_data_dir: Option<PathBuf>,
+        /// PostgreSQL database for the jobs, which must be empty [default: a store in the data directory]
+        #[arg(long, value_name = "URL")]
+        to_store: Option<String>,
+        /// Bucket or folder for the files [default: the data directory]
+        #[arg(long, value_name = "URL")]
+        to_objects: Option<String>,
+    },
     /// Check that everything is present and intact; the data directory is only read. Exits with 1 on a fault
     Verify {
         #[command(flatten)]
         data: DataDir,
+        #[command(flatten)]
+        files: ObjectsArg,
         #[command(flatten)]
         copy: CopyArgs,
         /// Also hash every file that a job references
@@ -77,9 +98,17 @@ struct DataDir {
     json: bool,
 }
 
+/// Where the files of jobs are.
+#[derive(Args, Debug)]
+struct ObjectsArg {
+    /// Bucket or folder of the coordinator's files [default: they are in the data directory]
+    #[arg(long, value_name = "URL", env = "FATHOM_OBJECTS")]
+    objects: Option<String>,
+}
+
 impl DataDir {
     fn place(&self) -> Place {
-        Place { data_dir: self.data_dir.clone(), store: self.store.clone() }
+        Place { data_dir: self.data_dir.clone(), store: self.store.clone(), objects: None }
     }
 }
 
@@ -109,9 +138,38 @@ pub async fn run(args: StoreArgs) -> Result<()> {
             let counts = maintenance::import(&file, &data.place()).await.map_err(failed)?;
             print_counts(counts, data.json, &format!("imported into {}", data.place()))
         }
-        What::Verify { data, copy, deep } => {
-            let found =
-                maintenance::verify(&data.place(), copy.scratch.as_deref(), deep).await.map_err(failed)?;
+        What::Move { data, files, copy, to_data_dir, to_store, to_objects } => {
+            let from = Place { objects: files.objects, ..data.place() };
+            let data_dir = to_data_dir.unwrap_or_else(|| data.data_dir.clone());
+            let to = Place { data_dir, store: to_store, objects: to_objects };
+            let moved =
+                maintenance::move_service(&from, copy.scratch.as_deref(), &to).await.map_err(failed)?;
+            let Moved { counts, blobs, bytes, logs, damaged, faults } = moved;
+            if data.json {
+                let Counts { jobs, tasks, events, datasets } = counts;
+                output::json(&json!({
+                    "jobs": jobs, "tasks": tasks, "events": events, "datasets": datasets,
+                    "copied_blobs": blobs, "copied_bytes": bytes, "copied_logs": logs,
+                    "damaged": damaged, "faults": faults,
+                }))?;
+            } else {
+                damaged.iter().for_each(|digest| {
+                    output::line(format!("blob {digest} is damaged; it was not copied"));
+                });
+                faults.iter().for_each(output::line);
+                let rest = format!("{blobs} blobs of {bytes} bytes and {logs} files of logs copied to {to}");
+                print_counts(counts, false, &rest)?;
+            }
+            match faults.len() {
+                0 => Ok(()),
+                count => Err(CliError::Message(format!(
+                    "{count} faults in {to}; the old service is unchanged: repair it, remove the jobs in {to}, and move again"
+                ))),
+            }
+        }
+        What::Verify { data, files, copy, deep } => {
+            let place = Place { objects: files.objects, ..data.place() };
+            let found = maintenance::verify(&place, copy.scratch.as_deref(), deep).await.map_err(failed)?;
             if data.json {
                 let Counts { jobs, tasks, events, datasets } = found.counts;
                 output::json(&json!({

@@ -114,7 +114,11 @@ pub async fn run(args: TokenArgs) -> Result<()> {
 /// The store to read or write instead of calling the service.
 fn place(data_dir: Option<&PathBuf>, store: Option<&String>) -> Option<Place> {
     let is_named = data_dir.is_some() || store.is_some();
-    is_named.then(|| Place { data_dir: data_dir.cloned().unwrap_or_default(), store: store.cloned() })
+    is_named.then(|| Place {
+        data_dir: data_dir.cloned().unwrap_or_default(),
+        store: store.cloned(),
+        objects: None,
+    })
 }
 
 async fn issue(args: IssueArgs) -> Result<()> {

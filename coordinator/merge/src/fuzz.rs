@@ -29,7 +29,7 @@ fn fuzzed_results_of_partitions_are_merged_or_refused() {
         let manifest = ModelManifest::new(&plan, "0", &results, &merged);
         let json = serde_json::to_vec(&manifest).unwrap();
         let manifest: ModelManifest = serde_json::from_slice(&json).unwrap();
-        manifest.of_changed_rows(&out, &digest).unwrap();
+        manifest.of_changed_rows(&crate::local_files(), &out, &digest).unwrap();
         true
     };
     let words = [

@@ -14,6 +14,7 @@ mod border;
 mod candidate;
 mod copy;
 mod duplicates;
+mod files;
 mod manifest;
 mod near_borders;
 mod ply_rows;
@@ -24,10 +25,12 @@ mod thinning;
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use fathom_core::config::MergeConfig;
 use fathom_plan::{Partition, PartitionId, Plan};
 
+pub use files::{Files, LocalFiles, ReadSeek, local_files};
 pub use manifest::{BlockEntry, ModelManifest, PartitionEntry};
 use ply_rows::PlyFile;
 use source::{Extent, Source};
@@ -174,8 +177,8 @@ impl MergeError {
     }
 }
 
-/// Merges the results of all partitions of `plan` into the PLY `out`, whose folder must exist; at most `cap`
-/// Gaussians.
+/// Merges the results of all partitions of `plan`, on the local disk, into the PLY `out`, whose folder must
+/// exist; at most `cap` Gaussians.
 ///
 /// # Errors
 /// [`MergeError`]; `out` is then as it was before.
@@ -186,7 +189,22 @@ pub fn merge(
     cap: u64,
     out: &Path,
 ) -> Result<Merged, MergeError> {
-    let sources = sources(plan, results)?;
+    merge_from(&local_files(), plan, results, config, cap, out)
+}
+
+/// As [`merge`], of results in `files`; `out` is on the local disk.
+///
+/// # Errors
+/// As [`merge`].
+pub fn merge_from(
+    files: &Arc<dyn Files>,
+    plan: &Plan,
+    results: &[PartitionResult],
+    config: &MergeConfig,
+    cap: u64,
+    out: &Path,
+) -> Result<Merged, MergeError> {
+    let sources = sources(files, plan, results)?;
     let survey = survey(&sources, config)?;
     let temporary = temporary_name(out);
     let written = write(&sources, &survey, cap, &temporary);
@@ -203,10 +221,14 @@ pub fn merge(
 }
 
 /// The files of all partitions in the plan's order, once their headers agree.
-fn sources<'a>(plan: &'a Plan, results: &'a [PartitionResult]) -> Result<Vec<Source<'a>>, MergeError> {
+fn sources<'a>(
+    files: &Arc<dyn Files>,
+    plan: &'a Plan,
+    results: &'a [PartitionResult],
+) -> Result<Vec<Source<'a>>, MergeError> {
     let mut sources: Vec<Source<'a>> = Vec::with_capacity(plan.partitions.len());
     for (index, (partition, result)) in (0..).zip(in_order(plan, results)?) {
-        let file = PlyFile::read(&result.path)?;
+        let file = PlyFile::read(files, &result.path)?;
         if let Some(Source { partition: Partition { id: first, .. }, file: PlyFile { layout, .. }, .. }) =
             sources.first()
         {

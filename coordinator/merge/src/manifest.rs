@@ -5,12 +5,13 @@
 //! row_bytes`. Within a partition they go along a curve through space, in the order in which workers submit
 //! their Gaussians.
 
-use std::fs::File;
 use std::io::{BufReader, Read, Seek, SeekFrom};
 use std::path::Path;
+use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 
+use crate::files::Files;
 use crate::ply_rows::PlyFile;
 use crate::source::Extent;
 use crate::{MergeError, Merged, MergedBlock, PartitionResult};
@@ -127,13 +128,18 @@ impl ModelManifest {
         }
     }
 
-    /// The manifest of `model`, a file with the BLAKE3 `digest` and the rows of the merged model with other
-    /// values: digest and bounds are new.
+    /// The manifest of `model`, a file in `files` with the BLAKE3 `digest` and the rows of the merged model
+    /// with other values: digest and bounds are new.
     ///
     /// # Errors
     /// When it cannot be read, or its number or size of rows differs from the merged model.
-    pub fn of_changed_rows(self, model: &Path, digest: &str) -> Result<Self, MergeError> {
-        let file = PlyFile::read(model)?;
+    pub fn of_changed_rows(
+        self,
+        files: &Arc<dyn Files>,
+        model: &Path,
+        digest: &str,
+    ) -> Result<Self, MergeError> {
+        let file = PlyFile::read(files, model)?;
         let header_bytes = file.header.len() as u64;
         let row_bytes = file.layout.row_bytes();
         if (file.rows, row_bytes as u64) != (self.gaussians, self.row_bytes) {
@@ -143,7 +149,8 @@ impl ModelManifest {
             );
             return Err(MergeError::File { path: model.to_owned(), message });
         }
-        let mut rows = BufReader::new(File::open(model).map_err(MergeError::io("read", model))?);
+        let (rows, _) = files.open(model).map_err(MergeError::io("read", model))?;
+        let mut rows = BufReader::new(rows);
         rows.seek(SeekFrom::Start(header_bytes)).map_err(MergeError::io("read", model))?;
         let mut bytes = Vec::new();
         let mut blocks = Vec::with_capacity(self.blocks.len());

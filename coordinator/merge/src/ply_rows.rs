@@ -3,11 +3,12 @@
 //! The merge copies rows as they are, and decodes little: centre and opacity, near borders also shape and
 //! colour. All other properties that a trainer writes survive bit for bit.
 
-use std::fs::File;
-use std::io::{BufRead, BufReader, Read, Seek, SeekFrom};
+use std::io::{BufRead, BufReader, Read, SeekFrom};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use crate::MergeError;
+use crate::files::{Files, ReadSeek};
 
 /// Rows of a block, which share one bound. The trainer culls in blocks of the same size (`CULL_CHUNK` of
 /// `core::gpu`).
@@ -124,6 +125,8 @@ fn float(row: &[u8], at: usize) -> f32 {
 /// A file of Gaussians with a parsed header and a verified length.
 #[derive(Clone, Debug)]
 pub struct PlyFile {
+    /// Where it is.
+    pub files: Arc<dyn Files>,
     /// Its path.
     pub path: PathBuf,
     /// The row layout, from the header.
@@ -140,10 +143,9 @@ impl PlyFile {
     /// # Errors
     /// When the file cannot be read, is not a little-endian PLY whose only element has x, y, z and opacity,
     /// or its length does not match its header.
-    pub fn read(path: &Path) -> Result<Self, MergeError> {
+    pub fn read(files: &Arc<dyn Files>, path: &Path) -> Result<Self, MergeError> {
         let fault = |message: String| MergeError::File { path: path.to_owned(), message };
-        let file = File::open(path).map_err(MergeError::io("read", path))?;
-        let bytes = file.metadata().map_err(MergeError::io("read", path))?.len();
+        let (file, bytes) = files.open(path).map_err(MergeError::io("read", path))?;
         let (layout, rows, header) = read_header(path, &mut BufReader::new(file))?;
         if rows > u64::from(u32::MAX) {
             return Err(fault(format!("has {rows} Gaussians; a partition has at most {}", u32::MAX)));
@@ -158,7 +160,7 @@ impl PlyFile {
         if bytes > whole {
             return Err(fault(format!("has bytes after its last row (row {rows} of {rows})")));
         }
-        Ok(Self { path: path.to_owned(), layout, rows, header })
+        Ok(Self { files: Arc::clone(files), path: path.to_owned(), layout, rows, header })
     }
 
     /// Number of blocks: all but the last have [`BLOCK_ROWS`] rows.
@@ -186,7 +188,7 @@ impl PlyFile {
     /// # Errors
     /// When the file can no longer be read.
     pub fn open(&self) -> Result<Blocks<'_>, MergeError> {
-        let file = File::open(&self.path).map_err(MergeError::io("read", &self.path))?;
+        let (file, _) = self.files.open(&self.path).map_err(MergeError::io("read", &self.path))?;
         Ok(Blocks { of: self, file, at: None })
     }
 }
@@ -194,7 +196,7 @@ impl PlyFile {
 /// An open file, to read blocks.
 pub struct Blocks<'a> {
     of: &'a PlyFile,
-    file: File,
+    file: Box<dyn ReadSeek>,
     /// The next block without seeking.
     at: Option<u64>,
 }

@@ -222,7 +222,7 @@ fn a_result_that_changes_between_the_passes_is_noticed_by_block() {
     // No border crosses it, so the second pass examines none of its rows.
     let plan = grid_plan(1, 1);
     let results = write_results(&plan, &random_means(9000), folder.path());
-    let sources = sources(&plan, &results).unwrap();
+    let sources = sources(&local_files(), &plan, &results).unwrap();
     let survey = survey(&sources, &MergeConfig::default()).unwrap();
     let out = folder.path().join("model.ply");
     let mut bytes = fs::read(&results[0].path).unwrap();
@@ -247,7 +247,7 @@ fn uncut_blocks_are_copied_whole_and_outside_blocks_not_read() {
     };
     let means: Vec<[f32; 3]> = (0..6 * 4096).map(mean).collect();
     let results = write_results(&plan, &means, folder.path());
-    let sources = sources(&plan, &results).unwrap();
+    let sources = sources(&local_files(), &plan, &results).unwrap();
     let survey = survey(&sources, &MergeConfig::default()).unwrap();
     let inside = |source: usize| survey.blocks[source].iter().map(|block| block.inside).collect::<Vec<_>>();
     assert_eq!(inside(0), [4096, 4096, 4096, 0, 0, 0]);
@@ -305,7 +305,7 @@ fn the_manifest_covers_the_model_and_bounds_every_centre() {
         assert_eq!((partition.first, &partition.result), (first, &result.digest));
         first += partition.kept;
         let all = partition.kept + partition.cropped + partition.duplicates + partition.thinned;
-        assert_eq!(all, PlyFile::read(&result.path).unwrap().rows);
+        assert_eq!(all, PlyFile::read(&local_files(), &result.path).unwrap().rows);
         assert!(partition.duplicates > 0, "{partition:?}");
     }
 }
@@ -319,7 +319,7 @@ fn the_manifest_follows_rows_that_were_trained_after_the_merge() {
     let results = write_row_results(&plan, &model.rows, folder.path());
     let merged = merge(&plan, &results, 9000, &out).unwrap();
     let manifest = ModelManifest::new(&plan, "plan", &results, &merged);
-    let same = manifest.clone().of_changed_rows(&out, &manifest.blake3).unwrap();
+    let same = manifest.clone().of_changed_rows(&local_files(), &out, &manifest.blake3).unwrap();
     assert_eq!(same, manifest);
 
     let (mut bytes, row_bytes) = (fs::read(&out).unwrap(), manifest.row_bytes as usize);
@@ -328,14 +328,14 @@ fn the_manifest_follows_rows_that_were_trained_after_the_merge() {
     bytes[at..at + 4].copy_from_slice(&1e6_f32.to_le_bytes());
     fs::write(&out, &bytes).unwrap();
     let digest = blake3::hash(&bytes).to_hex().to_string();
-    let after = manifest.clone().of_changed_rows(&out, &digest).unwrap();
+    let after = manifest.clone().of_changed_rows(&local_files(), &out, &digest).unwrap();
     assert_eq!((after.blake3.as_str(), after.blocks[1].max[0]), (digest.as_str(), 1e6));
     for (index, (block, before)) in after.blocks.iter().zip(&manifest.blocks).enumerate() {
         assert_eq!((block.first, block.rows), (before.first, before.rows));
         assert_eq!(block == before, index != 1, "block {index}");
     }
     fs::write(&out, ply(&[[0.0; 3]; 12], 9)).unwrap();
-    let refused = manifest.of_changed_rows(&out, &digest).unwrap_err().to_string();
+    let refused = manifest.of_changed_rows(&local_files(), &out, &digest).unwrap_err().to_string();
     assert!(refused.contains("12 rows"), "{refused}");
 }
 
@@ -348,7 +348,7 @@ fn deciding_region_by_region_gives_the_same_bytes() {
     let [one, other] = ["one.ply", "other.ply"].map(|name| folder.path().join(name));
     let in_memory = MergeConfig::default();
     let in_regions = MergeConfig { memory_mib: 1, ..in_memory.clone() };
-    let near = survey(&sources(&plan, &results).unwrap(), &in_memory).unwrap();
+    let near = survey(&sources(&local_files(), &plan, &results).unwrap(), &in_memory).unwrap();
     let candidates: usize = near.blocks.iter().flatten().filter(|block| block.reach >= 0.0).count();
     assert!(candidates > 3, "{candidates} blocks with candidates");
     let counts = super::merge(&plan, &results, &in_memory, u64::MAX, &one).unwrap();

@@ -21,7 +21,7 @@ use crate::access::{Access, Principal, Role, Token, TokenRecord};
 use crate::clock::Clock;
 use crate::datasets::{FileList, ListedFile, MANIFEST_PATH, NewDataset};
 use crate::logs::JobLogs;
-use crate::objects::TenantBlobs;
+use crate::objects::{ObjectsAt, TenantBlobs};
 use crate::retention::Policy;
 use crate::schedule::{JobId, Rules, TaskStats, Tenant};
 use crate::services::{Admin, Jobs, Uploads, Workers, encode};
@@ -89,8 +89,11 @@ struct Coordinator {
 impl Coordinator {
     async fn new(name: &str) -> Self {
         let folder = Folder::new(name);
-        let objects = TenantBlobs::open(folder.path(), 0, Clock::start()).unwrap();
-        let manifest = objects.of(&Tenant::default()).unwrap().put(ANYTHING.into()).await.unwrap();
+        let objects = {
+            let at = ObjectsAt::Folder(folder.path().to_owned());
+            TenantBlobs::open(at, folder.path(), 0, Clock::start()).await.unwrap()
+        };
+        let manifest = objects.of(&Tenant::default()).await.unwrap().put(ANYTHING.into()).await.unwrap();
         let store = MemoryStore::new(Rules::default(), 30_000, 0);
         let new = NewJob {
             job_id: job_id(),
@@ -99,7 +102,7 @@ impl Coordinator {
             ..NewJob::sample(0)
         };
         store.submit(new, 1_700_000_000_000).await.unwrap();
-        let objects_of_all = objects.of(&Tenant::default()).unwrap();
+        let objects_of_all = objects.of(&Tenant::default()).await.unwrap();
         objects_of_all.put(scene().into()).await.unwrap();
         let list = dataset();
         let dataset = NewDataset {
@@ -284,7 +287,7 @@ fn fuzzed_calls_of_uploads_are_answered_or_refused() {
                 let v1::WriteBlobRequest { blob, offset_bytes, data, finish, .. } =
                     message::<v1::WriteBlobRequest>(bytes)?.into_inner();
                 let blob = encode::required_blob("blob", blob).ok()?;
-                let objects = shared.objects.of(&Tenant::default()).ok()?;
+                let objects = shared.objects.of(&Tenant::default()).await.ok()?;
                 let Some(mut writer) = objects.begin_write(&blob, offset_bytes, None).await.ok()? else {
                     return Some(());
                 };

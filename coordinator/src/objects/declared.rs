@@ -4,10 +4,9 @@
 //! writes, otherwise with the bytes received. Otherwise unfinished uploads could fill the disk.
 
 use std::collections::HashMap;
-use std::io;
 use std::sync::PoisonError;
 
-use super::{BlobStore, ObjectError, garbage};
+use super::{BlobStore, ObjectError};
 
 /// Bytes of incomplete uploads, by digest.
 #[derive(Debug, Default)]
@@ -61,14 +60,6 @@ impl BlobStore {
             return Err(ObjectError::OverLimit { used_bytes, limit_bytes });
         }
         declared.set(digest, bytes);
-        Ok(())
-    }
-
-    /// Counts uploads of an earlier process.
-    pub(super) fn find_declared(&self) -> io::Result<()> {
-        for (path, name) in garbage::files(&self.root.join("uploads"))? {
-            self.declare(name.trim_end_matches(".part"), std::fs::metadata(path)?.len());
-        }
         Ok(())
     }
 }

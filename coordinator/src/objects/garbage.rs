@@ -8,11 +8,12 @@
 use std::collections::HashSet;
 use std::fs::File;
 use std::io;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering;
 use std::sync::{PoisonError, RwLock};
 use std::time::{Duration, SystemTime};
 
+use super::disk::Disk;
 use super::{BlobStore, check_digest};
 
 /// The last-used time of a blob is refreshed only if it is older than this: many checks cause one write. It
@@ -41,76 +42,83 @@ impl Removed {
     }
 }
 
-impl BlobStore {
-    /// The bytes of all blobs, by a scan.
-    pub(super) fn count_bytes(&self) -> io::Result<u64> {
-        let mut bytes = 0;
-        for folder in folders(&self.root.join("cas"))? {
-            for (path, _) in files(&folder)? {
-                bytes += std::fs::metadata(path)?.len();
-            }
+/// The bytes of all blobs in a folder, by a scan.
+pub(super) fn count_bytes(disk: &Disk) -> io::Result<u64> {
+    let mut bytes = 0;
+    for folder in folders(&disk.root.join("cas"))? {
+        for (path, _) in files(&folder)? {
+            bytes += std::fs::metadata(path)?.len();
         }
-        Ok(bytes)
     }
+    Ok(bytes)
+}
 
-    /// Removes blobs and uploads that were last used or written before `before`, except the blobs `used`.
-    ///
-    /// # Errors
-    /// When a folder cannot be read or a file cannot be removed; files removed before stay removed.
-    pub fn remove_unused(&self, before: SystemTime, used: &HashSet<String>) -> io::Result<Removed> {
-        let mut removed = Removed::default();
-        for folder in folders(&self.root.join("cas"))? {
-            for (path, name) in files(&folder)? {
-                if check_digest(&name).is_err() || used.contains(&name) {
-                    continue;
-                }
-                if let Some(bytes) = self.remove_if_old(&path, before)? {
-                    removed.blobs += 1;
-                    removed.bytes += bytes;
-                    self.whole_bytes.fetch_sub(bytes, Ordering::Relaxed);
-                }
-            }
-        }
-        for (path, name) in files(&self.root.join("uploads"))? {
-            let digest = name.trim_end_matches(".part");
-            if self.writing.lock().unwrap_or_else(PoisonError::into_inner).contains(digest) {
+/// Uploads of an earlier process: digests and received bytes.
+pub(super) fn uploads(disk: &Disk) -> io::Result<Vec<(String, u64)>> {
+    let length = |(path, name): (PathBuf, String)| {
+        Ok((name.trim_end_matches(".part").to_owned(), std::fs::metadata(path)?.len()))
+    };
+    files(&disk.root.join("uploads"))?.into_iter().map(length).collect()
+}
+
+/// As [`BlobStore::remove_unused`], of the files in a folder.
+pub(super) fn remove_unused(
+    store: &BlobStore,
+    disk: &Disk,
+    before: SystemTime,
+    used: &HashSet<String>,
+) -> io::Result<Removed> {
+    let mut removed = Removed::default();
+    for folder in folders(&disk.root.join("cas"))? {
+        for (path, name) in files(&folder)? {
+            if check_digest(&name).is_err() || used.contains(&name) {
                 continue;
             }
-            if let Some(bytes) = self.remove_if_old(&path, before)? {
-                self.declare(digest, 0);
-                removed.uploads += 1;
-                removed.bytes += bytes;
-            }
-        }
-        for (path, _) in files(&self.root.join("damaged"))? {
-            if let Some(bytes) = self.remove_if_old(&path, before)? {
+            if let Some(bytes) = remove_if_old(disk, &path, before)? {
                 removed.blobs += 1;
                 removed.bytes += bytes;
+                store.whole_bytes.fetch_sub(bytes, Ordering::Relaxed);
             }
         }
-        Ok(removed)
     }
+    for (path, name) in files(&disk.root.join("uploads"))? {
+        let digest = name.trim_end_matches(".part");
+        if store.is_written(digest) {
+            continue;
+        }
+        if let Some(bytes) = remove_if_old(disk, &path, before)? {
+            store.declare(digest, 0);
+            removed.uploads += 1;
+            removed.bytes += bytes;
+        }
+    }
+    for (path, _) in files(&disk.root.join("damaged"))? {
+        if let Some(bytes) = remove_if_old(disk, &path, before)? {
+            removed.blobs += 1;
+            removed.bytes += bytes;
+        }
+    }
+    Ok(removed)
+}
 
-    /// Removes a file unless it is younger than `before`; returns its length if removed. A file from the
-    /// future is from before the clock was set back. It counts as made now; otherwise it would stay until
-    /// that time.
-    fn remove_if_old(&self, path: &Path, before: SystemTime) -> io::Result<Option<u64>> {
-        let _nobody_asks = self.asked.write().unwrap_or_else(PoisonError::into_inner);
-        let found = match std::fs::metadata(path) {
-            Ok(found) => found,
-            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
-            Err(error) => return Err(error),
-        };
-        let (modified, now) = (found.modified()?, self.clock.system_time());
-        if modified > now {
-            write_time(path, now)?;
-        }
-        if modified >= before {
-            return Ok(None);
-        }
-        std::fs::remove_file(path)?;
-        Ok(Some(found.len()))
+/// Removes a file unless it is younger than `before`; returns its length if removed. A file from the future
+/// is from before the clock was set back. It counts as made now; otherwise it would stay until that time.
+fn remove_if_old(disk: &Disk, path: &Path, before: SystemTime) -> io::Result<Option<u64>> {
+    let _nobody_asks = disk.asked.write().unwrap_or_else(PoisonError::into_inner);
+    let found = match std::fs::metadata(path) {
+        Ok(found) => found,
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
+        Err(error) => return Err(error),
+    };
+    let (modified, now) = (found.modified()?, disk.clock.system_time());
+    if modified > now {
+        write_time(path, now)?;
     }
+    if modified >= before {
+        return Ok(None);
+    }
+    std::fs::remove_file(path)?;
+    Ok(Some(found.len()))
 }
 
 /// The length of a blob's file, whose last-used time becomes `now` if set; `None` if there is no file.
@@ -135,7 +143,7 @@ pub(super) fn write_time(path: &Path, now: SystemTime) -> io::Result<()> {
 }
 
 /// Folders in a folder by name; empty if it does not exist.
-fn folders(folder: &Path) -> io::Result<Vec<std::path::PathBuf>> {
+fn folders(folder: &Path) -> io::Result<Vec<PathBuf>> {
     let entries = match std::fs::read_dir(folder) {
         Ok(entries) => entries,
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
@@ -153,7 +161,7 @@ fn folders(folder: &Path) -> io::Result<Vec<std::path::PathBuf>> {
 }
 
 /// Files in a folder with their names, by name.
-pub(super) fn files(folder: &Path) -> io::Result<Vec<(std::path::PathBuf, String)>> {
+pub(super) fn files(folder: &Path) -> io::Result<Vec<(PathBuf, String)>> {
     let mut found = Vec::new();
     for entry in std::fs::read_dir(folder)? {
         let entry = entry?;

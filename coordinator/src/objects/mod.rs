@@ -1,14 +1,20 @@
 //! Bytes by content: photographs, plans, checkpoints, models.
 //!
-//! A blob lives at `cas/aa/<digest>` of the object store (`aa`: the first two digits of its BLAKE3) and is
-//! never changed. An upload grows under `uploads/<digest>.part` on the same file system. When length and
-//! digest are as declared, it is synced and renamed into place. So a blob is visible completely or not at
-//! all, whatever crashes. The client's digest is never trusted. A blob that the disk has changed is
+//! A blob lives at `cas/aa/<digest>` (`aa`: the first two digits of its BLAKE3) of a folder (`disk.rs`) or of
+//! a bucket (`bucket.rs`), and is never changed. An upload grows under `uploads`. When length and digest are
+//! as declared, it is made durable and moved to its key. So a blob is visible completely or not at all,
+//! whatever crashes. The client's digest is never trusted. A blob that the disk or the bucket has changed is
 //! quarantined (`damaged.rs`) when a reader notices.
 
+mod bucket;
 mod damaged;
 mod declared;
+mod disk;
+mod error;
 mod garbage;
+mod place;
+mod reader;
+mod segments;
 mod tenants;
 mod writer;
 
@@ -16,122 +22,49 @@ use std::collections::HashSet;
 use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, PoisonError, RwLock};
+use std::sync::{Arc, Mutex, PoisonError};
 
 use bytes::Bytes;
 use fathom_core::scene::BlobRef;
 use fathom_observe::threads;
-use object_store::local::LocalFileSystem;
+use futures::{StreamExt, TryStreamExt};
 use object_store::path::Path as ObjectPath;
 use object_store::{ObjectStore, ObjectStoreExt};
 
 use crate::clock::Clock;
 
+use bucket::Bucket;
+use disk::{Disk, spawn_io};
+pub use error::ObjectError;
 pub use garbage::Removed;
+pub use place::ObjectsAt;
 pub use tenants::TenantBlobs;
 pub use writer::BlobWriter;
-
-/// Errors of the object store.
-#[derive(Debug, thiserror::Error)]
-pub enum ObjectError {
-    /// Not 64 lower-case hex digits.
-    #[error("{0:?} is not a digest; a digest is BLAKE3 as 64 lower-case hex digits")]
-    BadDigest(String),
-    /// There is no such blob.
-    #[error("there is no blob {0}; upload it first")]
-    NotFound(String),
-    /// A write at the wrong offset.
-    #[error("the upload of {digest} continues at byte {committed_bytes}, not at {offset_bytes}")]
-    WrongOffset {
-        /// The blob.
-        digest: String,
-        /// The offset received.
-        offset_bytes: u64,
-        /// The offset expected.
-        committed_bytes: u64,
-    },
-    /// The bytes differ from the declaration.
-    #[error("blob {digest}: {message}; the received bytes were deleted, send the blob again")]
-    DigestMismatch {
-        /// The declared digest.
-        digest: String,
-        /// The fault.
-        message: String,
-    },
-    /// A blob that is too large to be read into memory as its type.
-    #[error("blob {digest} is {bytes} bytes; the limit for this type is {most}")]
-    TooLarge {
-        /// The blob.
-        digest: String,
-        /// Its length.
-        bytes: u64,
-        /// The limit.
-        most: u64,
-    },
-    /// A blob has changed on disk.
-    #[error(
-        "blob {0} has another digest on the coordinator's disk: the disk changed it; check the disk, and upload the blob again"
-    )]
-    Damaged(String),
-    /// Another stream writes this blob.
-    #[error("blob {0} is being written by another stream; call QueryBlob and try again")]
-    Busy(String),
-    /// A tenant would exceed its quota.
-    #[error("the blobs use {used_bytes} of {limit_bytes} bytes")]
-    OverLimit {
-        /// Bytes used.
-        used_bytes: u64,
-        /// Bytes allowed.
-        limit_bytes: u64,
-    },
-    /// The disk is nearly full.
-    #[error(
-        "{free_bytes} bytes are free on the coordinator's disk, but {min_free_bytes} must stay free; free some space"
-    )]
-    LowSpace {
-        /// Bytes free.
-        free_bytes: u64,
-        /// Bytes that must stay free.
-        min_free_bytes: u64,
-    },
-    /// The file system failed.
-    #[error("cannot {action} {path}: {source}", path = path.display())]
-    Io {
-        /// "read", "write", ...
-        action: &'static str,
-        /// The path.
-        path: PathBuf,
-        /// The error of the system.
-        source: io::Error,
-    },
-    /// The object store failed.
-    #[error("object store: {0}")]
-    Store(#[from] object_store::Error),
-}
 
 /// Largest blob that is read into memory, bytes. The largest such blobs are sparse points: 100 million, each
 /// seen by four views.
 const MAX_READ_BYTES: u64 = 4 << 30;
+/// Blobs that are checked at a time: a bucket answers each after milliseconds.
+const CHECKS_AT_ONCE: usize = 32;
 
 /// The blobs of one tenant.
 pub struct BlobStore {
-    store: Arc<dyn ObjectStore>,
-    root: PathBuf,
+    place: Place,
     min_free_bytes: u64,
-    /// Whether the store is read-only: damaged blobs stay in place, and checks refresh no times.
-    only_looks: bool,
     /// Clock for the age of files.
     clock: Clock,
     /// Digests that a stream is writing.
     writing: Mutex<HashSet<String>>,
-    /// Read-locked while a blob is checked, write-locked while one is removed.
-    asked: Arc<RwLock<()>>,
     /// Bytes of all complete blobs.
     whole_bytes: AtomicU64,
     /// Bytes of incomplete ones.
     declared: Mutex<declared::Declared>,
-    /// Held during the whole check of a possibly damaged blob: a new upload may replace it.
-    looking: Arc<Mutex<()>>,
+}
+
+/// Where blobs are.
+enum Place {
+    Disk(Arc<Disk>),
+    Bucket(Arc<Bucket>),
 }
 
 impl BlobStore {
@@ -141,13 +74,28 @@ impl BlobStore {
     /// # Errors
     /// When the directory cannot be created.
     pub fn open(root: &Path, min_free_bytes: u64, clock: Clock) -> Result<Self, ObjectError> {
-        for folder in [root.to_owned(), root.join("uploads"), root.join("staging"), root.join("damaged")] {
-            std::fs::create_dir_all(&folder).map_err(io_error("create", &folder))?;
-        }
-        let store = Self { min_free_bytes, only_looks: false, clock, ..Self::existing(root)? };
-        let whole_bytes = store.count_bytes().map_err(io_error("read", root))?;
-        store.whole_bytes.store(whole_bytes, Ordering::Relaxed);
-        store.find_declared().map_err(io_error("read", root))?;
+        let disk = Disk::open(root, clock)?;
+        let whole_bytes = garbage::count_bytes(&disk).map_err(io_error("read", root))?;
+        let uploads = garbage::uploads(&disk).map_err(io_error("read", root))?;
+        let store = Self::over(Place::Disk(Arc::new(disk)), min_free_bytes, clock);
+        store.start_with(whole_bytes, uploads);
+        Ok(store)
+    }
+
+    /// Opens the store in a bucket, which is listed once. Files that become blobs are written to `staging`
+    /// first.
+    ///
+    /// # Errors
+    /// When the bucket cannot be listed, or `staging` cannot be created.
+    async fn open_bucket(
+        store: Arc<dyn ObjectStore>,
+        staging: PathBuf,
+        clock: Clock,
+    ) -> Result<Self, ObjectError> {
+        let bucket = Bucket::open(store, staging, clock)?;
+        let content = bucket.content().await?;
+        let store = Self::over(Place::Bucket(Arc::new(bucket)), 0, clock);
+        store.start_with(content.whole_bytes, content.uploads);
         Ok(store)
     }
 
@@ -155,21 +103,47 @@ impl BlobStore {
     ///
     /// # Errors
     /// When the directory does not exist.
-    pub fn existing(root: &Path) -> Result<Self, ObjectError> {
-        // Without `with_fsync` a blob that was acknowledged can be lost or empty after a power cut.
-        let store = LocalFileSystem::new_with_prefix(root)?.with_fsync(true);
-        Ok(Self {
-            store: Arc::new(store),
-            root: root.to_owned(),
-            min_free_bytes: 0,
-            only_looks: true,
-            clock: Clock::start(),
+    fn existing(root: &Path) -> Result<Self, ObjectError> {
+        Ok(Self::over(Place::Disk(Arc::new(Disk::existing(root)?)), 0, Clock::start()))
+    }
+
+    /// The same in a bucket.
+    fn existing_bucket(store: Arc<dyn ObjectStore>) -> Self {
+        let clock = Clock::start();
+        Self::over(Place::Bucket(Arc::new(Bucket::existing(store, PathBuf::new(), clock))), 0, clock)
+    }
+
+    fn over(place: Place, min_free_bytes: u64, clock: Clock) -> Self {
+        Self {
+            place,
+            min_free_bytes,
+            clock,
             writing: Mutex::default(),
-            asked: Arc::default(),
             whole_bytes: AtomicU64::new(0),
             declared: Mutex::default(),
-            looking: Arc::default(),
-        })
+        }
+    }
+
+    fn start_with(&self, whole_bytes: u64, uploads: impl IntoIterator<Item = (String, u64)>) {
+        self.whole_bytes.store(whole_bytes, Ordering::Relaxed);
+        for (digest, bytes) in uploads {
+            self.declare(&digest, bytes);
+        }
+    }
+
+    fn objects(&self) -> &dyn ObjectStore {
+        match &self.place {
+            Place::Disk(disk) => disk.store(),
+            Place::Bucket(bucket) => bucket.store().as_ref(),
+        }
+    }
+
+    /// The error of a failed request.
+    fn failed(&self, error: object_store::Error) -> ObjectError {
+        match self.place {
+            Place::Disk(_) => error.into(),
+            Place::Bucket(_) => ObjectError::Unavailable(error),
+        }
     }
 
     fn whole_bytes(&self) -> u64 {
@@ -182,7 +156,7 @@ impl BlobStore {
     /// # Errors
     /// When the folder cannot be read or a file cannot be removed.
     pub fn discard_staged(&self) -> Result<(), ObjectError> {
-        let folder = self.root.join("staging");
+        let folder = self.staging();
         for entry in std::fs::read_dir(&folder).map_err(io_error("read", &folder))? {
             let path = entry.map_err(io_error("read", &folder))?.path();
             std::fs::remove_file(&path).map_err(io_error("remove", &path))?;
@@ -193,10 +167,34 @@ impl BlobStore {
 
     /// Whether the blob is present and complete. From now on garbage collection spares it for a while.
     pub async fn contains(&self, blob: &BlobRef) -> Result<bool, ObjectError> {
-        let (path, asked) = (self.local_path(blob)?, Arc::clone(&self.asked));
-        let now = (!self.only_looks).then(|| self.clock.system_time());
-        let bytes = spawn_io(&path.clone(), move || garbage::ask(&asked, &path, now)).await?;
+        let bytes = match &self.place {
+            Place::Disk(disk) => disk.ask(&blob.digest).await?,
+            Place::Bucket(bucket) => bucket.ask(&blob.digest).await?,
+        };
         Ok(bytes == Some(blob.bytes))
+    }
+
+    /// The indices of those blobs that are not present and complete; the others as by
+    /// [`BlobStore::contains`].
+    pub async fn missing(&self, blobs: &[BlobRef]) -> Result<Vec<usize>, ObjectError> {
+        let mut missing = Vec::new();
+        if let Place::Disk(_) = self.place {
+            for (index, blob) in blobs.iter().enumerate() {
+                if !self.contains(blob).await? {
+                    missing.push(index);
+                }
+            }
+            return Ok(missing);
+        }
+        let checks = futures::stream::iter(0..blobs.len()).map(|index| async move {
+            let is_there = self.contains(&blobs[index]).await?;
+            Ok::<_, ObjectError>((!is_there).then_some(index))
+        });
+        let mut checks = checks.buffered(CHECKS_AT_ONCE);
+        while let Some(index) = checks.try_next().await? {
+            missing.extend(index);
+        }
+        Ok(missing)
     }
 
     /// Returns an error that names the blob unless it is present.
@@ -206,11 +204,26 @@ impl BlobStore {
 
     /// Length of a blob.
     pub async fn size(&self, digest: &str) -> Result<u64, ObjectError> {
-        match threads::by_library(self.store.head(&object_path(digest)?)).await {
+        match threads::by_library(self.objects().head(&object_path(digest)?)).await {
             Ok(meta) => Ok(meta.size),
             Err(object_store::Error::NotFound { .. }) => Err(ObjectError::NotFound(digest.to_owned())),
-            Err(error) => Err(error.into()),
+            Err(error) => Err(self.failed(error)),
         }
+    }
+
+    /// All blobs.
+    pub async fn list(&self) -> Result<Vec<BlobRef>, ObjectError> {
+        let mut listed = self.objects().list(Some(&ObjectPath::from("cas")));
+        let mut blobs = Vec::new();
+        while let Some(meta) = listed.try_next().await.map_err(|error| self.failed(error))? {
+            let digest = meta.location.filename().unwrap_or_default().to_owned();
+            // Other files there are not ours.
+            if check_digest(&digest).is_ok() {
+                blobs.push(BlobRef { digest, bytes: meta.size });
+            }
+        }
+        blobs.sort_by(|a, b| a.digest.cmp(&b.digest));
+        Ok(blobs)
     }
 
     /// Received bytes of a blob, and whether it is complete and visible.
@@ -219,23 +232,32 @@ impl BlobStore {
         if self.contains(blob).await? {
             return Ok((blob.bytes, true));
         }
-        let path = self.part_path(&blob.digest);
-        let part = path.clone();
-        let arrived = spawn_io(&path, move || match std::fs::metadata(&part) {
-            Ok(meta) => Ok(meta.len()),
-            Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(0),
-            Err(error) => Err(error),
-        });
-        Ok((arrived.await?, false))
+        let arrived = match &self.place {
+            Place::Disk(disk) => disk.arrived(&blob.digest).await?,
+            Place::Bucket(bucket) => segments::arrived_bytes(bucket, &blob.digest).await?,
+        };
+        Ok((arrived, false))
     }
 
-    /// Bytes of a blob from `offset` on, at most `limit`. Not checked against the digest: the reader does.
-    pub async fn read_range(&self, digest: &str, offset: u64, limit: u64) -> Result<Bytes, ObjectError> {
-        let end = self.size(digest).await?.min(offset.saturating_add(limit));
-        if offset >= end {
-            return Ok(Bytes::new());
+    /// Bytes that a reader of a whole blob asks for at a time: each request to a bucket takes some 20 ms.
+    pub fn read_bytes(&self) -> u64 {
+        match self.place {
+            Place::Disk(_) => 256 << 10,
+            Place::Bucket(_) => 2 << 20,
         }
-        Ok(threads::by_library(self.store.get_range(&object_path(digest)?, offset..end)).await?)
+    }
+
+    /// A range that lies within a blob. Not checked against the digest: the reader does.
+    pub async fn range(&self, digest: &str, range: std::ops::Range<u64>) -> Result<Bytes, ObjectError> {
+        let wanted = range.end - range.start;
+        let read = threads::by_library(self.objects().get_range(&object_path(digest)?, range)).await;
+        match read {
+            Ok(bytes) if bytes.len() as u64 == wanted => Ok(bytes),
+            // It has become shorter.
+            Ok(_) => Err(ObjectError::Damaged(digest.to_owned())),
+            Err(object_store::Error::NotFound { .. }) => Err(ObjectError::NotFound(digest.to_owned())),
+            Err(error) => Err(self.failed(error)),
+        }
     }
 
     /// A whole blob, checked against its digest; at most 4 GiB of it.
@@ -251,8 +273,13 @@ impl BlobStore {
         }
         // The length must match the reference, or it is not this blob.
         self.require(blob).await?;
-        let path = object_path(&blob.digest)?;
-        let bytes = threads::by_library(async { self.store.get(&path).await?.bytes().await }).await?;
+        let bytes = match &self.place {
+            Place::Disk(disk) => {
+                let path = object_path(&blob.digest)?;
+                threads::by_library(async { disk.store().get(&path).await?.bytes().await }).await?
+            }
+            Place::Bucket(bucket) => bucket.read(&blob.digest, blob.bytes).await?,
+        };
         if blake3::hash(&bytes).to_hex().as_str() == blob.digest {
             return Ok(bytes);
         }
@@ -265,31 +292,37 @@ impl BlobStore {
         let digest = blake3::hash(&bytes).to_hex().to_string();
         let blob = BlobRef { digest, bytes: bytes.len() as u64 };
         if !self.contains(&blob).await? {
-            threads::by_library(self.store.put(&object_path(&blob.digest)?, bytes.into())).await?;
-            self.write_time(self.local_path(&blob)?).await?;
+            match &self.place {
+                Place::Disk(disk) => disk.put(&blob.digest, bytes).await?,
+                Place::Bucket(bucket) => bucket.put(&blob.digest, bytes).await?,
+            }
             self.whole_bytes.fetch_add(blob.bytes, Ordering::Relaxed);
         }
         Ok(blob)
     }
 
-    /// The file of a blob, for readers that stream.
-    pub fn local_path(&self, blob: &BlobRef) -> Result<PathBuf, ObjectError> {
-        check_digest(&blob.digest)?;
-        Ok(self.root.join(object_path(&blob.digest)?.as_ref()))
+    /// The local folder of [`BlobStore::staging_path`].
+    fn staging(&self) -> PathBuf {
+        match &self.place {
+            Place::Disk(disk) => disk.root.join("staging"),
+            Place::Bucket(bucket) => bucket.staging.clone(),
+        }
     }
 
-    /// A path on the same file system for a file that [`BlobStore::adopt`] takes over.
+    /// A path on the local disk for a file that [`BlobStore::adopt`] takes over.
     pub fn staging_path(&self, name: &str) -> PathBuf {
-        self.root.join("staging").join(name)
+        self.staging().join(name)
     }
 
     /// Turns a file under [`BlobStore::staging_path`] into a blob. The coordinator has written, hashed and
-    /// synced it; the file is moved.
+    /// synced it; the file is moved, or uploaded and removed.
     pub async fn adopt(&self, name: &str, blob: BlobRef) -> Result<BlobRef, ObjectError> {
         let is_new = !self.contains(&blob).await?;
-        let (from, to) = (ObjectPath::from_iter(["staging", name]), object_path(&blob.digest)?);
-        self.write_time(self.staging_path(name)).await?;
-        threads::by_library(self.store.rename(&from, &to)).await?;
+        let file = self.staging_path(name);
+        match &self.place {
+            Place::Disk(disk) => disk.adopt(&file, &blob.digest).await?,
+            Place::Bucket(bucket) => bucket.adopt(&file, &blob.digest).await?,
+        }
         if is_new {
             self.whole_bytes.fetch_add(blob.bytes, Ordering::Relaxed);
         }
@@ -309,7 +342,7 @@ impl BlobStore {
         limit_bytes: Option<u64>,
     ) -> Result<Option<BlobWriter>, ObjectError> {
         check_digest(&blob.digest)?;
-        let mut claim = WriteClaim::take(self, &blob.digest)?;
+        let claim = WriteClaim::take(self, &blob.digest)?;
         let (committed_bytes, complete) = self.committed(blob).await?;
         if complete {
             return Ok(None);
@@ -323,34 +356,66 @@ impl BlobStore {
         }
         self.check_space(blob.bytes.saturating_sub(offset)).await?;
         self.declare_within(&blob.digest, blob.bytes, limit_bytes)?;
-        claim.arrived_bytes = Some(offset);
+        claim.count(offset);
         BlobWriter::open(claim, blob.clone(), offset).await.map(Some)
     }
 
-    /// Bytes free on its disk, and bytes that must stay free.
-    pub async fn space(&self) -> Result<(u64, u64), ObjectError> {
-        let root = self.root.clone();
-        let free_bytes = spawn_io(&self.root, move || free_bytes(&root)).await?;
-        Ok((free_bytes, self.min_free_bytes))
-    }
-
-    /// Refuses if writing `bytes` more would leave too little free.
+    /// Refuses if writing `bytes` more would leave too little free. A bucket is never full.
     pub async fn check_space(&self, bytes: u64) -> Result<(), ObjectError> {
-        let (free_bytes, min_free_bytes) = self.space().await?;
-        if free_bytes.saturating_sub(bytes) < min_free_bytes {
-            return Err(ObjectError::LowSpace { free_bytes, min_free_bytes });
+        match &self.place {
+            Place::Disk(disk) => check_disk(&disk.root, self.min_free_bytes, bytes).await,
+            Place::Bucket(_) => Ok(()),
         }
-        Ok(())
     }
 
-    async fn write_time(&self, path: PathBuf) -> Result<(), ObjectError> {
-        let now = self.clock.system_time();
-        spawn_io(&path.clone(), move || garbage::write_time(&path, now)).await
+    /// Removes blobs and uploads that were last used or written before `before`, except the blobs `used`.
+    ///
+    /// # Errors
+    /// When blobs cannot be listed or removed; those removed before stay removed.
+    pub async fn remove_unused(
+        self: &Arc<Self>,
+        before: std::time::SystemTime,
+        used: HashSet<String>,
+    ) -> Result<Removed, ObjectError> {
+        match &self.place {
+            Place::Disk(disk) => {
+                let (store, root) = (Arc::clone(self), disk.root.clone());
+                let disk = Arc::clone(disk);
+                spawn_io(&root, move || garbage::remove_unused(&store, &disk, before, &used)).await
+            }
+            Place::Bucket(bucket) => {
+                let gone = |gone: bucket::Gone<'_>| match gone {
+                    bucket::Gone::Blob { bytes } => {
+                        self.whole_bytes.fetch_sub(bytes, Ordering::Relaxed);
+                    }
+                    bucket::Gone::Upload { digest, bytes } => {
+                        self.declare(digest, self.declared_bytes(digest).saturating_sub(bytes));
+                    }
+                };
+                bucket.remove_unused(before, &used, |digest| self.is_written(digest), gone).await
+            }
+        }
     }
 
-    fn part_path(&self, digest: &str) -> PathBuf {
-        self.root.join("uploads").join(part_name(digest))
+    /// Whether a stream writes the blob.
+    fn is_written(&self, digest: &str) -> bool {
+        self.writing.lock().unwrap_or_else(PoisonError::into_inner).contains(digest)
     }
+}
+
+/// Refuses if writing `bytes` more to the disk of `path` would leave less than `min_free_bytes`.
+async fn check_disk(path: &Path, min_free_bytes: u64, bytes: u64) -> Result<(), ObjectError> {
+    let free_bytes = free_bytes(path).await?;
+    if free_bytes.saturating_sub(bytes) < min_free_bytes {
+        return Err(ObjectError::LowSpace { free_bytes, min_free_bytes });
+    }
+    Ok(())
+}
+
+/// Bytes free on the disk of `path`.
+async fn free_bytes(path: &Path) -> Result<u64, ObjectError> {
+    let owned = path.to_owned();
+    spawn_io(path, move || disk::free_bytes(&owned)).await
 }
 
 /// The exclusive right to write one blob; returned when dropped.
@@ -358,32 +423,33 @@ struct WriteClaim {
     store: Arc<BlobStore>,
     digest: String,
     /// Received bytes; `None` until the upload counts.
-    arrived_bytes: Option<u64>,
+    arrived_bytes: Mutex<Option<u64>>,
 }
 
 impl WriteClaim {
     fn take(store: &Arc<BlobStore>, digest: &str) -> Result<Self, ObjectError> {
         let mut writing = store.writing.lock().unwrap_or_else(PoisonError::into_inner);
         if writing.insert(digest.to_owned()) {
-            Ok(Self { store: Arc::clone(store), digest: digest.to_owned(), arrived_bytes: None })
+            Ok(Self { store: Arc::clone(store), digest: digest.to_owned(), arrived_bytes: Mutex::default() })
         } else {
             Err(ObjectError::Busy(digest.to_owned()))
         }
+    }
+
+    /// Bytes that count when the writer ends.
+    fn count(&self, arrived_bytes: u64) {
+        *self.arrived_bytes.lock().unwrap_or_else(PoisonError::into_inner) = Some(arrived_bytes);
     }
 }
 
 impl Drop for WriteClaim {
     fn drop(&mut self) {
         // Before another stream may write it.
-        if let Some(bytes) = self.arrived_bytes {
+        if let Some(bytes) = *self.arrived_bytes.get_mut().unwrap_or_else(PoisonError::into_inner) {
             self.store.declare(&self.digest, bytes);
         }
         self.store.writing.lock().unwrap_or_else(PoisonError::into_inner).remove(&self.digest);
     }
-}
-
-fn part_name(digest: &str) -> String {
-    format!("{digest}.part")
 }
 
 /// This also keeps `..` and `/` out of every path made from a digest.
@@ -401,47 +467,15 @@ fn object_path(digest: &str) -> Result<ObjectPath, ObjectError> {
     Ok(ObjectPath::from_iter(["cas", &digest[..2], digest]))
 }
 
-impl ObjectError {
-    /// Whether the disk, or the process's quota on it, is full.
-    pub fn is_full(&self) -> bool {
-        let mut cause: Option<&(dyn std::error::Error + 'static)> = Some(self);
-        while let Some(error) = cause {
-            if let Some(error) = error.downcast_ref::<io::Error>()
-                && matches!(error.kind(), io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded)
-            {
-                return true;
-            }
-            cause = error.source();
-        }
-        false
-    }
-}
-
 fn io_error(action: &'static str, path: &Path) -> impl FnOnce(io::Error) -> ObjectError + use<> {
     let path = path.to_owned();
     move |source| ObjectError::Io { action, path, source }
 }
 
-/// Runs blocking file work on a thread for it.
-async fn spawn_io<T: Send + 'static>(
-    path: &Path,
-    work: impl FnOnce() -> io::Result<T> + Send + 'static,
-) -> Result<T, ObjectError> {
-    let result = threads::blocking(work).await.unwrap_or_else(|e| Err(io::Error::other(e)));
-    result.map_err(io_error("use", path))
-}
-
-#[cfg(unix)]
-fn free_bytes(path: &Path) -> io::Result<u64> {
-    let stat = rustix::fs::statvfs(path)?;
-    Ok(stat.f_bavail.saturating_mul(stat.f_frsize))
-}
-
-/// Where the system cannot be asked, the disk counts as empty; writes to a full one still fail.
-#[cfg(not(unix))]
-fn free_bytes(_path: &Path) -> io::Result<u64> {
-    Ok(u64::MAX)
-}
-
+#[cfg(test)]
+mod bucket_tests;
+#[cfg(test)]
+#[path = "../../../tests/support/s3.rs"]
+pub(crate) mod s3_server;
 #[cfg(test)]
 mod tests;

@@ -12,6 +12,13 @@ fn open() -> (tempfile::TempDir, Arc<BlobStore>) {
     (dir, store)
 }
 
+fn part_path(store: &BlobStore, blob: &BlobRef) -> PathBuf {
+    match &store.place {
+        Place::Disk(disk) => disk.part_path(&blob.digest),
+        Place::Bucket(_) => panic!("a bucket has no such file"),
+    }
+}
+
 #[tokio::test]
 async fn a_broken_upload_resumes_even_in_another_process() {
     let (dir, store) = open();
@@ -57,7 +64,7 @@ async fn bytes_added_by_another_write_are_found_before_publishing() {
     let blob = blob_of(b"the truth");
     let mut writer = store.begin_write(&blob, 0, None).await.unwrap().unwrap();
     writer.append(0, Bytes::from_static(b"the truth")).await.unwrap();
-    let mut late = std::fs::OpenOptions::new().append(true).open(store.part_path(&blob.digest)).unwrap();
+    let mut late = std::fs::OpenOptions::new().append(true).open(part_path(&store, &blob)).unwrap();
     std::io::Write::write_all(&mut late, b" and more").unwrap();
     let error = writer.finish().await.unwrap_err();
     assert!(error.to_string().contains("18 bytes are on the disk, 9 were declared"), "{error}");
@@ -91,7 +98,7 @@ async fn an_invalid_digest_reaches_no_file() {
 async fn a_blob_that_changed_on_the_disk_is_noticed_by_its_reader() {
     let (_dir, store) = open();
     let blob = store.put(Bytes::from_static(b"sound")).await.unwrap();
-    std::fs::write(store.local_path(&blob).unwrap(), b"sOund").unwrap();
+    std::fs::write(store.path_of(&blob).unwrap(), b"sOund").unwrap();
     assert!(matches!(store.read(&blob).await, Err(ObjectError::Damaged(_))));
 }
 
@@ -132,25 +139,25 @@ async fn old_blobs_are_removed_unless_used_or_checked() {
     };
     let part = || dir.path().join("uploads").join(format!("{}.part", half.digest));
     for blob in [&used, &asked, &old] {
-        age(store.local_path(blob).unwrap());
+        age(store.path_of(blob).unwrap());
     }
     age(part());
     let kept = std::collections::HashSet::from([used.digest.clone()]);
     assert!(store.contains(&asked).await.unwrap());
     assert!(BlobStore::existing(dir.path()).unwrap().contains(&old).await.unwrap(), "only looks");
-    let removed = store.remove_unused(now - day, &kept).unwrap();
+    let removed = store.remove_unused(now - day, kept.clone()).await.unwrap();
     assert_eq!(removed, Removed { blobs: 1, uploads: 0, bytes: 3 }, "a running upload is not garbage");
     for (blob, is_there) in [(&used, true), (&asked, true), (&old, false), (&young, true)] {
         assert_eq!(store.contains(blob).await.unwrap(), is_there, "{blob:?}");
     }
     upload.pause().await.unwrap();
     age(part());
-    let removed = store.remove_unused(now - day, &kept).unwrap();
+    let removed = store.remove_unused(now - day, kept.clone()).await.unwrap();
     assert_eq!(removed, Removed { blobs: 0, uploads: 1, bytes: 2 });
     assert_eq!(store.committed(&half).await.unwrap(), (0, false), "it restarts");
     // A used blob becomes garbage once it is unused.
-    age(store.local_path(&used).unwrap());
-    assert_eq!(store.remove_unused(now - day, &Default::default()).unwrap().blobs, 1);
+    age(store.path_of(&used).unwrap());
+    assert_eq!(store.remove_unused(now - day, HashSet::new()).await.unwrap().blobs, 1);
 }
 
 #[tokio::test]
@@ -170,10 +177,10 @@ async fn the_age_of_files_follows_the_coordinators_clock() {
     upload.append(0, Bytes::from_static(b"ha")).await.unwrap();
     drop(upload);
     for blob in [&made, &adopted, &sent] {
-        let file = std::fs::metadata(store.local_path(blob).unwrap()).unwrap();
+        let file = std::fs::metadata(store.path_of(blob).unwrap()).unwrap();
         assert!(file.modified().unwrap() < in_1999.system_time() + YEAR, "{blob:?}");
     }
-    let removed = store.remove_unused(in_1999.system_time() + YEAR, &HashSet::new()).unwrap();
+    let removed = store.remove_unused(in_1999.system_time() + YEAR, HashSet::new()).await.unwrap();
     assert_eq!(removed, Removed { blobs: 3, uploads: 1, bytes: 16 });
 }
 
@@ -188,10 +195,13 @@ async fn files_from_the_future_count_as_made_now() {
     let store = Arc::new(BlobStore::open(dir.path(), 0, now).unwrap());
     let an_hour = std::time::Duration::from_secs(3600);
     let none = HashSet::new();
-    assert_eq!(store.remove_unused(now.system_time() - an_hour, &none).unwrap(), Removed::default());
-    let file = std::fs::metadata(store.local_path(&blob).unwrap()).unwrap();
+    assert_eq!(
+        store.remove_unused(now.system_time() - an_hour, none.clone()).await.unwrap(),
+        Removed::default()
+    );
+    let file = std::fs::metadata(store.path_of(&blob).unwrap()).unwrap();
     assert!(file.modified().unwrap() <= now.system_time(), "it would stay for three days");
-    assert_eq!(store.remove_unused(now.system_time() + an_hour, &none).unwrap().blobs, 1);
+    assert_eq!(store.remove_unused(now.system_time() + an_hour, none.clone()).await.unwrap().blobs, 1);
 }
 
 #[tokio::test]
@@ -213,7 +223,7 @@ async fn a_changed_blob_is_quarantined_and_can_be_sent_again() {
     let blob = store.put(Bytes::from_static(b"the truth")).await.unwrap();
     assert!(!store.set_aside_if_damaged(&blob.digest).await.unwrap(), "an intact blob was quarantined");
     assert!(!store.set_aside_if_damaged(&"0".repeat(64)).await.unwrap(), "a missing blob cannot be damaged");
-    std::fs::write(store.local_path(&blob).unwrap(), b"the troth").unwrap();
+    std::fs::write(store.path_of(&blob).unwrap(), b"the troth").unwrap();
 
     // A read-only store changes nothing.
     let looking = BlobStore::existing(dir.path()).unwrap();
@@ -230,11 +240,11 @@ async fn a_changed_blob_is_quarantined_and_can_be_sent_again() {
     assert_eq!(store.read(&blob).await.unwrap(), &b"the truth"[..]);
 
     // It is removed when it is old.
-    let removed = store.remove_unused(std::time::SystemTime::UNIX_EPOCH, &HashSet::new()).unwrap();
+    let removed = store.remove_unused(std::time::SystemTime::UNIX_EPOCH, HashSet::new()).await.unwrap();
     assert_eq!((removed.blobs, aside.exists()), (0, true));
     let later = std::time::SystemTime::now() + std::time::Duration::from_secs(60);
     let used = HashSet::from([blob.digest.clone()]);
-    assert_eq!(store.remove_unused(later, &used).unwrap().blobs, 1);
+    assert_eq!(store.remove_unused(later, used).await.unwrap().blobs, 1);
     assert!(!aside.exists() && store.contains(&blob).await.unwrap());
 }
 

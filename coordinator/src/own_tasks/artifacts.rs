@@ -1,6 +1,7 @@
 //! The files of a succeeded job; `docs/using/output.md` lists their names and contents.
 
 use std::collections::HashMap;
+use std::sync::Arc;
 
 use bytes::Bytes;
 use fathom_core::cover::{self, CoverReport};
@@ -62,7 +63,7 @@ fn unreadable(artifact: Artifact, blob: &BlobRef, error: &dyn std::error::Error)
 }
 
 /// Writes the files of a job whose model is merged and evaluated.
-pub async fn assemble(objects: &BlobStore, view: &JobView) -> Result<TaskOutput, OwnTaskError> {
+pub async fn assemble(objects: &Arc<BlobStore>, view: &JobView) -> Result<TaskOutput, OwnTaskError> {
     let job = &view.job;
     let model = made(job, Artifact::Model)?.clone();
     let plan_json = made(job, Artifact::Plan)?.clone();
@@ -127,7 +128,7 @@ pub async fn assemble(objects: &BlobStore, view: &JobView) -> Result<TaskOutput,
 
 /// `model.json` of the final model: that of the merge, or with new bounds if borders were trained since.
 async fn manifest_of(
-    objects: &BlobStore,
+    objects: &Arc<BlobStore>,
     merged: &BlobRef,
     model: &BlobRef,
 ) -> Result<BlobRef, OwnTaskError> {
@@ -137,9 +138,10 @@ async fn manifest_of(
     if manifest.blake3 == model.digest {
         return Ok(merged.clone());
     }
-    let (path, digest) = (objects.local_path(model)?, model.digest.clone());
+    let (files, path, digest) = (objects.files(), objects.path_of(model)?, model.digest.clone());
     let json = blocking(move || {
-        let manifest = manifest.of_changed_rows(&path, &digest).map_err(|e| failed(e.to_string()))?;
+        let manifest = manifest.of_changed_rows(&files, &path, &digest);
+        let manifest = manifest.map_err(|error| OwnTaskError::of_merge(&error))?;
         serde_json::to_vec(&manifest).map_err(|e| failed(e.to_string()))
     });
     Ok(objects.put(json.await?.into()).await?)

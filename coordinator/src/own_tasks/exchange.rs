@@ -6,11 +6,13 @@
 //! bytes again.
 
 use std::collections::BTreeMap;
+use std::io::BufReader;
+use std::sync::Arc;
 
 use fathom_core::exchange::Exchange;
-use fathom_core::ply;
+use fathom_core::ply::SplatReader;
 use fathom_core::scene::BlobRef;
-use fathom_core::water::{Consensus, PartitionEvidence, Water, consensus, four_digits};
+use fathom_core::water::{Consensus, PartitionEvidence, Water, WaterRecord, consensus, four_digits};
 use fathom_proto::worker::v1::FirstPartResult;
 use prost::Message;
 
@@ -27,7 +29,7 @@ const FORMAT: u32 = 1;
 pub const MAX_FIRST_PART_BYTES: u64 = 64 << 10;
 
 /// Computes the input of the second parts, once all first parts are done.
-pub async fn exchange_results(objects: &BlobStore, view: &JobView) -> Result<TaskOutput, OwnTaskError> {
+pub async fn exchange_results(objects: &Arc<BlobStore>, view: &JobView) -> Result<TaskOutput, OwnTaskError> {
     let config = config_of(&view.job)?;
     let mut results = Vec::new();
     let mut rows = BTreeMap::new();
@@ -60,7 +62,7 @@ pub async fn exchange_results(objects: &BlobStore, view: &JobView) -> Result<Tas
 
 /// The consensus of the water parameters that the first parts found.
 async fn water_of(
-    objects: &BlobStore,
+    objects: &Arc<BlobStore>,
     view: &JobView,
     results: &[(u32, FirstPartResult)],
 ) -> Result<Consensus, OwnTaskError> {
@@ -75,8 +77,13 @@ async fn water_of(
             )));
         }
     }
-    let path = objects.local_path(made(&view.job, Artifact::CoarseModel)?)?;
-    let coarse = blocking(move || ply::water_record(&path).map_err(|e| OwnTaskError::failed(e.to_string())));
+    let (files, path) = (objects.files(), objects.path_of(made(&view.job, Artifact::CoarseModel)?)?);
+    let coarse = blocking(move || {
+        let (file, _) = files.open(&path).map_err(|error| OwnTaskError::of_io(&error))?;
+        let header = SplatReader::new(BufReader::new(file), "the coarse model");
+        let water = header.and_then(|header| WaterRecord::among(header.comments()));
+        water.map_err(|e| OwnTaskError::failed(e.to_string()))
+    });
     let coarse = coarse.await?;
     let (Some(coarse), Some(unit)) = (coarse, unit) else {
         return Err(OwnTaskError::failed("the coarse model or its partitions have no water".into()));

@@ -1,10 +1,12 @@
 //! Merges the partitions of a job; `fathom_merge` does the work.
 
+use std::sync::Arc;
+
 use bytes::Bytes;
 use fathom_core::ply;
 use fathom_core::scene::BlobRef;
 use fathom_core::water::WaterRecord;
-use fathom_merge::{ModelManifest, PartitionResult, merge};
+use fathom_merge::{ModelManifest, PartitionResult, merge_from};
 use fathom_plan::PartitionId;
 use serde::{Deserialize, Serialize};
 
@@ -33,7 +35,7 @@ pub struct MergeReport {
 
 /// Merges the partitions' results into one model.
 pub async fn merge_job(
-    objects: &BlobStore,
+    objects: &Arc<BlobStore>,
     view: &JobView,
     lease: &Lease,
 ) -> Result<TaskOutput, OwnTaskError> {
@@ -51,7 +53,7 @@ pub async fn merge_job(
             handed_in.push((task.task, result));
             results.push(PartitionResult {
                 partition: PartitionId(index),
-                path: objects.local_path(result)?,
+                path: objects.path_of(result)?,
                 digest: result.digest.clone(),
             });
         }
@@ -59,9 +61,10 @@ pub async fn merge_job(
     // The fence in the name: a merge of an earlier process can still be writing.
     let staged = format!("merge-{}-{}.ply", lease.job, lease.fence);
     let out = objects.staging_path(&staged);
+    let files = objects.files();
     let made = blocking(move || {
-        let merged = merge(&plan, &results, &config.merge, cap, &out)
-            .map_err(|e| OwnTaskError::failed(e.to_string()))?;
+        let merged = merge_from(&files, &plan, &results, &config.merge, cap, &out)
+            .map_err(|error| OwnTaskError::of_merge(&error))?;
         let manifest = ModelManifest::new(&plan, &plan_digest, &results, &merged);
         let manifest = serde_json::to_vec(&manifest).map_err(|e| OwnTaskError::failed(e.to_string()))?;
         let water = ply::water_record(&out).map_err(|e| OwnTaskError::failed(e.to_string()))?;

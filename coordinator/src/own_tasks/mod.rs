@@ -30,6 +30,10 @@ const OWN_TASKS_AT_ONCE: usize = 2;
 /// Longest interval between checks: the end of a back-off wakes no one.
 const LOOK_EVERY: Duration = Duration::from_millis(250);
 
+/// Longest pause before a task that a bucket's outage interrupted begins again; each request has been tried
+/// for some seconds before.
+const LONGEST_PAUSE: Duration = Duration::from_secs(15);
+
 /// Claims and runs own tasks until the coordinator stops.
 pub async fn run_own_tasks(shared: Arc<State>) {
     let incarnation = Uuid::new_v4().to_string();
@@ -82,7 +86,7 @@ async fn run_task(shared: &State, grant: Grant, stopping: &mut watch::Receiver<b
     let mut renewals = tokio::time::interval(Duration::from_millis(u64::from(shared.lease_ms / 4).max(1)));
     let begin = Instant::now();
     tracing::info!("task taken");
-    let work = execute(shared, &grant);
+    let work = execute_through_outages(shared, &grant);
     tokio::pin!(work);
     let result = loop {
         tokio::select! {
@@ -136,9 +140,24 @@ async fn run_task(shared: &State, grant: Grant, stopping: &mut watch::Receiver<b
     shared.wakeups.changed();
 }
 
+/// Runs a task, again when the bucket is available again: an outage is no failed attempt.
+async fn execute_through_outages(shared: &State, grant: &Grant) -> Result<TaskOutput, OwnTaskError> {
+    let mut pause = LOOK_EVERY;
+    loop {
+        match execute(shared, grant).await {
+            Err(error) if error.is_outage => {
+                tracing::warn!(%error, seconds = pause.as_secs_f64(), "the task begins again after a pause");
+                tokio::time::sleep(pause).await;
+                pause = (pause * 2).min(LONGEST_PAUSE);
+            }
+            result => return result,
+        }
+    }
+}
+
 async fn execute(shared: &State, grant: &Grant) -> Result<TaskOutput, OwnTaskError> {
     let view = shared.jobs.job(&grant.lease.job).await.map_err(|e| OwnTaskError::failed(e.to_string()))?;
-    let objects = shared.objects.of(&view.job.tenant)?;
+    let objects = shared.objects.of(&view.job.tenant).await?;
     match grant.lease.task.stage {
         Stage::Plan => plan::plan_job(&objects, &view.job, shared.workers.connected(&view.job.tenant)).await,
         Stage::Exchange => exchange::exchange_results(&objects, &view).await,

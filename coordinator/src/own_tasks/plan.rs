@@ -203,17 +203,17 @@ async fn put_partitions(
 /// Every photograph must be present before a worker trains for hours on the others.
 async fn require_uploads(objects: &BlobStore, manifest: &Manifest) -> Result<(), OwnTaskError> {
     objects.require(&manifest.points).await?;
-    for view in &manifest.views {
-        for blob in std::iter::once(&view.image).chain(&view.mask) {
-            if !objects.contains(blob).await? {
-                return Err(OwnTaskError::input(format!(
-                    "{}: blob {} has not been uploaded; upload all files of the manifest and submit again",
-                    view.name, blob.digest
-                )));
-            }
-        }
+    let of_views = manifest.views.iter();
+    let named = of_views
+        .flat_map(|view| std::iter::once(&view.image).chain(&view.mask).map(move |blob| (view, blob)));
+    let (views, blobs): (Vec<_>, Vec<_>) = named.map(|(view, blob)| (view, blob.clone())).unzip();
+    match objects.missing(&blobs).await?.first() {
+        None => Ok(()),
+        Some(&first) => Err(OwnTaskError::input(format!(
+            "{}: blob {} has not been uploaded; upload all files of the manifest and submit again",
+            views[first].name, blobs[first].digest
+        ))),
     }
-    Ok(())
 }
 
 /// `memory_bytes` is the forecast of its memory, 0 where there is none.

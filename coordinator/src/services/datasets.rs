@@ -39,7 +39,7 @@ pub async fn begin(
         "" => DatasetId::of_request(&tenant, &request_id),
         id => id.parse()?,
     };
-    let objects = shared.objects.of(&tenant)?;
+    let objects = shared.objects.of(&tenant).await?;
     let list = match list {
         Some(_) if !files.is_empty() => {
             return Err(bad_argument("list", "is set together with files; set only one of them"));
@@ -60,15 +60,14 @@ pub async fn begin(
     let (mut missing, mut missing_count) = (Vec::new(), 0);
     // The received parts of missing blobs count already.
     let (mut missing_bytes, mut counted_bytes) = (0_u64, 0_u64);
-    for blob in list.value.blobs().map(|file| file.blob()) {
-        if objects.contains(&blob).await? {
-            continue;
-        }
-        missing_count += 1;
-        missing_bytes = missing_bytes.saturating_add(blob.bytes);
-        counted_bytes = counted_bytes.saturating_add(objects.declared_bytes(&blob.digest));
-        if missing.len() < MAX_BLOBS {
-            missing.push(encode::blob(&blob));
+    for some in chunks(list.value.blobs().map(|file| file.blob())) {
+        for blob in objects.missing(&some).await?.into_iter().map(|index| &some[index]) {
+            missing_count += 1;
+            missing_bytes = missing_bytes.saturating_add(blob.bytes);
+            counted_bytes = counted_bytes.saturating_add(objects.declared_bytes(&blob.digest));
+            if missing.len() < MAX_BLOBS {
+                missing.push(encode::blob(blob));
+            }
         }
     }
     let (count, bytes) = (list.value.count(), list.value.bytes());
@@ -90,15 +89,15 @@ pub async fn commit(shared: &State, caller: &Principal, id: &str) -> Result<v1::
     let (tenant, id) = (caller.home(), id.parse::<DatasetId>()?);
     let mut record = shared.store.dataset(&tenant, &id).await?;
     if !record.is_committed() {
-        let objects = shared.objects.of(&tenant)?;
+        let objects = shared.objects.of(&tenant).await?;
         let list = read_list(&objects, &record.root).await?;
         let (mut count, mut first) = (0, None);
-        for file in list.value.blobs() {
-            // Its content was verified on arrival. From here on it is kept for the dataset.
-            if !objects.contains(&file.blob()).await? {
-                count += 1;
-                first.get_or_insert(file);
-            }
+        for some in chunks(list.value.blobs()) {
+            // Their content was verified on arrival. From here on they are kept for the dataset.
+            let blobs: Vec<BlobRef> = some.iter().map(|file| file.blob()).collect();
+            let missing = objects.missing(&blobs).await?;
+            count += missing.len() as u64;
+            first = first.or(missing.first().map(|&index| some[index]));
         }
         if let Some(file) = first {
             let (path, digest) = (file.path.to_owned(), file.digest.to_owned());
@@ -164,13 +163,21 @@ pub async fn committed(
     if !record.is_committed() {
         return Err(StoreError::DatasetNotCommitted(record.id).into());
     }
-    let list = read_list(&*shared.objects.of(tenant)?, &record.root).await?;
+    let list = read_list(&*shared.objects.of(tenant).await?, &record.root).await?;
     Ok((record, list))
 }
 
 /// The manifest in a dataset, if there is one.
 pub fn manifest_in(list: &FileList) -> Option<v1::BlobRef> {
     list.find(MANIFEST_PATH).map(|file| encode::blob(&file.blob()))
+}
+
+/// Items as lists that are short enough to check at a time.
+fn chunks<T>(mut items: impl Iterator<Item = T>) -> impl Iterator<Item = Vec<T>> {
+    std::iter::from_fn(move || {
+        let some: Vec<T> = items.by_ref().take(MAX_BLOBS).collect();
+        (!some.is_empty()).then_some(some)
+    })
 }
 
 /// A long value in memory, with its memory permit.

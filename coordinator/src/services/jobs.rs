@@ -95,7 +95,7 @@ impl Jobs {
         };
         let of_dataset = || dataset.as_ref().and_then(|(_, list)| datasets::manifest_in(&list.value));
         let manifest = encode::required_blob("manifest", manifest.or_else(of_dataset))?;
-        let objects = self.0.objects.of(&tenant)?;
+        let objects = self.0.objects.of(&tenant).await?;
         let (dataset, list) = dataset.map(|(dataset, list)| (dataset.id, list)).unzip();
         manifests::check(&objects, &manifest, list).await?;
         objects.check_space(0).await?;
@@ -192,7 +192,8 @@ impl Jobs {
             return Ok(v1::ListArtifactsResponse::default());
         };
         let first = first_artifact(&request.page_token, Some(index))?;
-        let files = ArtifactIndex::from_bytes(&self.0.objects.of(&job.tenant)?.read(index).await?)?.files;
+        let objects = self.0.objects.of(&job.tenant).await?;
+        let files = ArtifactIndex::from_bytes(&objects.read(index).await?)?.files;
         let next = first.saturating_add(limit);
         let next_page_token = if next < files.len() { artifact_token(next, index) } else { String::new() };
         let page = files.into_iter().skip(first).take(limit);

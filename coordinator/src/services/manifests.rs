@@ -69,17 +69,11 @@ pub async fn check(
         Ok(named)
     });
     let named = named.await.unwrap_or_else(|error| Err(format!("cannot be read: {error}")));
-    let (mut count, mut first) = (0, None);
-    for (name, blob) in named.map_err(refused)? {
-        if !objects.contains(&blob).await? {
-            count += 1;
-            first.get_or_insert((name, blob.digest));
-        }
-    }
-    match first {
-        Some((name, digest)) => Err(ServiceError::FilesMissing { of: "manifest", count, name, digest }),
-        None => Ok(()),
-    }
+    let (mut names, blobs): (Vec<String>, Vec<BlobRef>) = named.map_err(refused)?.into_iter().unzip();
+    let missing = objects.missing(&blobs).await?;
+    let Some(&first) = missing.first() else { return Ok(()) };
+    let (name, digest) = (names.swap_remove(first), blobs[first].digest.clone());
+    Err(ServiceError::FilesMissing { of: "manifest", count: missing.len() as u64, name, digest })
 }
 
 /// Photographs, masks and points of a manifest that the disk has lost or changed, by the names of their
@@ -99,12 +93,9 @@ pub async fn lost(objects: &BlobStore, manifest: &BlobRef) -> Result<Vec<String>
         named.push((view.name, view.image));
     }
     named.push(("the sparse points".to_owned(), manifest.points));
-    let mut is_whole = true;
-    for (_, blob) in &named {
-        is_whole &= objects.contains(blob).await?;
-    }
+    let blobs: Vec<BlobRef> = named.iter().map(|(_, blob)| blob.clone()).collect();
     let mut lost = Vec::new();
-    if !is_whole {
+    if !objects.missing(&blobs).await?.is_empty() {
         for (name, blob) in named {
             if objects.set_aside_if_damaged(&blob.digest).await? || !objects.contains(&blob).await? {
                 lost.push(name);

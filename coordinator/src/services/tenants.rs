@@ -15,7 +15,8 @@ impl Admin {
         let (store, objects) = (&self.0.store, &self.0.objects);
         let own: BTreeMap<Tenant, Quota> = store.quotas().await?.into_iter().collect();
         let usage: BTreeMap<Tenant, Usage> = store.usage().await?.into_iter().collect();
-        let mut names: BTreeSet<Tenant> = objects.all()?.into_iter().map(|(tenant, _)| tenant).collect();
+        let mut names: BTreeSet<Tenant> =
+            objects.all().await?.into_iter().map(|(tenant, _)| tenant).collect();
         names.extend(own.keys().chain(usage.keys()).cloned());
         names.extend(store.tokens().await?.into_iter().filter_map(|token| token.tenant));
         let mut tenants = Vec::with_capacity(names.len());
@@ -34,7 +35,7 @@ impl Admin {
             quota_is_own: is_own,
             open_jobs: has.open_jobs,
             leased_tasks: has.leased_tasks,
-            bytes: self.0.objects.used_bytes(name)?,
+            bytes: self.0.objects.used_bytes(name).await?,
         })
     }
 

@@ -22,8 +22,9 @@ use crate::state::State;
 
 /// Maximum blobs in one call.
 pub(super) const MAX_BLOBS: usize = 10_000;
-/// Bytes of a sent piece. Clients that read nothing leave as many pieces in memory as there are places.
-const READ_BYTES: u64 = 256 << 10;
+/// Bytes of a sent piece. Clients that read nothing leave as many pieces in memory as there are places; with
+/// blobs in a bucket, as many requests ([`BlobStore::read_bytes`]).
+const READ_BYTES: usize = 256 << 10;
 
 /// The service.
 pub struct Uploads(pub Arc<State>);
@@ -38,7 +39,7 @@ impl Uploads {
     }
 
     async fn objects(&self, caller: &Principal, job_id: &str) -> Result<Arc<BlobStore>, ServiceError> {
-        Ok(self.0.objects.of(&self.tenant(caller, job_id).await?)?)
+        Ok(self.0.objects.of(&self.tenant(caller, job_id).await?).await?)
     }
 
     async fn missing(
@@ -51,14 +52,13 @@ impl Uploads {
             return Err(ServiceError::BadArgument { field: "blobs", message });
         }
         let mut seen = HashSet::new();
-        let mut missing = Vec::new();
-        for blob in blobs {
-            let known = BlobRef { digest: blob.digest.clone(), bytes: blob.size_bytes };
-            if seen.insert(blob.digest.clone()) && !objects.contains(&known).await? {
-                missing.push(blob);
-            }
-        }
-        Ok(missing)
+        let asked: Vec<BlobRef> = blobs
+            .into_iter()
+            .filter(|blob| seen.insert(blob.digest.clone()))
+            .map(|blob| BlobRef { digest: blob.digest, bytes: blob.size_bytes })
+            .collect();
+        let missing = objects.missing(&asked).await?;
+        Ok(missing.into_iter().map(|index| encode::blob(&asked[index])).collect())
     }
 
     async fn write(
@@ -71,7 +71,7 @@ impl Uploads {
         let first = first.ok_or_else(empty)?;
         let blob = encode::required_blob("blob", first.blob.clone())?;
         let tenant = self.tenant(caller, &first.job_id).await?;
-        let objects = self.0.objects.of(&tenant)?;
+        let objects = self.0.objects.of(&tenant).await?;
         // Uploads of workers are accepted: a quota is no reason to discard hours of work. Without tokens,
         // workers are recognised by the job that they name.
         let is_result = if self.0.access.asks_for_tokens() {
@@ -132,21 +132,25 @@ impl Uploads {
             return Err(ServiceError::BadArgument { field: "offset_bytes", message });
         }
         let hasher = (offset == 0).then(blake3::Hasher::new);
-        let pieces = stream::unfold((offset, false, hasher), move |(offset, sent_any, mut hasher)| {
-            let (objects, metrics, digest) = (Arc::clone(&objects), Arc::clone(&metrics), digest.clone());
+        let reading = Reading { objects, digest, offset, size_bytes, hasher, ahead: Bytes::new() };
+        let pieces = stream::unfold((reading, false), move |(mut reading, sent_any)| {
+            let metrics = Arc::clone(&metrics);
             async move {
                 // One message even for an empty rest, so that the client learns the size.
-                if sent_any && offset >= size_bytes {
+                let offset_bytes = reading.offset;
+                if sent_any && offset_bytes >= size_bytes {
                     return None;
                 }
-                match read_piece(&objects, &digest, offset, size_bytes, hasher.as_mut()).await {
+                match reading.next_piece().await {
                     Ok(data) => {
                         metrics.served(data.len());
-                        let next = offset + data.len() as u64;
-                        let response = v1::ReadBlobResponse { offset_bytes: offset, size_bytes, data };
-                        Some((Ok(response), (next, true, hasher)))
+                        let response = v1::ReadBlobResponse { offset_bytes, size_bytes, data };
+                        Some((Ok(response), (reading, true)))
                     }
-                    Err(error) => Some((Err(ServiceError::from(error).into()), (size_bytes, true, None))),
+                    Err(error) => {
+                        reading.offset = size_bytes;
+                        Some((Err(ServiceError::from(error).into()), (reading, true)))
+                    }
                 }
             }
         });
@@ -154,23 +158,36 @@ impl Uploads {
     }
 }
 
-/// The piece of a blob at `offset`; the last one only if all bytes read match the blob's digest.
-async fn read_piece(
-    objects: &BlobStore,
-    digest: &str,
+/// A blob on its way to a client.
+struct Reading {
+    objects: Arc<BlobStore>,
+    digest: String,
+    /// Of the next piece.
     offset: u64,
     size_bytes: u64,
-    hasher: Option<&mut blake3::Hasher>,
-) -> Result<Bytes, ObjectError> {
-    let data = objects.read_range(digest, offset, READ_BYTES).await?;
-    let Some(hasher) = hasher else { return Ok(data) };
-    hasher.update(&data);
-    let is_whole = offset + data.len() as u64 >= size_bytes;
-    if is_whole && hasher.finalize().to_hex().as_str() != digest {
-        objects.set_aside_if_damaged(digest).await?;
-        return Err(ObjectError::Damaged(digest.to_owned()));
+    /// Where it is read from the beginning.
+    hasher: Option<blake3::Hasher>,
+    /// Bytes that are read and not sent.
+    ahead: Bytes,
+}
+
+impl Reading {
+    /// The next piece; the last one only if all bytes read match the blob's digest.
+    async fn next_piece(&mut self) -> Result<Bytes, ObjectError> {
+        if self.ahead.is_empty() && self.offset < self.size_bytes {
+            let end = self.size_bytes.min(self.offset + self.objects.read_bytes());
+            self.ahead = self.objects.range(&self.digest, self.offset..end).await?;
+        }
+        let data = self.ahead.split_to(self.ahead.len().min(READ_BYTES));
+        self.offset += data.len() as u64;
+        let Some(hasher) = &mut self.hasher else { return Ok(data) };
+        hasher.update(&data);
+        if self.offset >= self.size_bytes && hasher.finalize().to_hex().as_str() != self.digest {
+            self.objects.set_aside_if_damaged(&self.digest).await?;
+            return Err(ObjectError::Damaged(self.digest.clone()));
+        }
+        Ok(data)
     }
-    Ok(data)
 }
 
 async fn append(mut writer: BlobWriter, piece: v1::WriteBlobRequest) -> Result<BlobWriter, ServiceError> {

@@ -236,7 +236,7 @@ impl Workers {
     /// The lost files of the scene, if any: workers only know digests, and one at a time.
     async fn lost_files(&self, lease: &Lease) -> Option<String> {
         let job = self.0.jobs.job_row(&lease.job).await.ok()?;
-        let objects = self.0.objects.of(&job.tenant).ok()?;
+        let objects = self.0.objects.of(&job.tenant).await.ok()?;
         let lost = manifests::lost(&objects, &job.manifest).await;
         let lost =
             lost.inspect_err(|error| tracing::warn!(job = %lease.job, %error, "cannot check for lost files"));
@@ -246,7 +246,7 @@ impl Workers {
     /// The blob store of a lease's job.
     async fn objects(&self, lease: &Lease) -> Result<Arc<BlobStore>, ServiceError> {
         let tenant = self.0.jobs.job_row(&lease.job).await?.tenant;
-        Ok(self.0.objects.of(&tenant)?)
+        Ok(self.0.objects.of(&tenant).await?)
     }
 }
 

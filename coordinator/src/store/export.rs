@@ -1,10 +1,10 @@
 //! A store as one file: a backup independent of the database's format, and a way to move a store.
 //!
-//! A file is gzip over a line that names the format and then rows, `[length: u32][JSON][CRC-32C of length and
-//! JSON: u32]`, little endian. It contains jobs with their tasks and events, the request ids of deleted jobs,
-//! marks of workers, quotas, tokens, datasets and the last fence. The last row has the counts, so that a
-//! truncated file is detected. The file is written under a temporary name and renamed, and read to its end
-//! before anything is imported.
+//! A file is gzip over a line that names the format and then rows,
+//! `[length: u32][JSON][CRC-32C of length and JSON: u32]`, little endian. It contains jobs with their tasks
+//! and events, the request ids of deleted jobs, marks of workers, quotas, tokens, datasets, the last fence,
+//! and the name of the deployment. The last row has the counts, so that a truncated file is detected. The
+//! file is written under a temporary name and renamed, and read to its end before anything is imported.
 
 use std::fs::File;
 use std::io::{self, BufReader, Read, Write};
@@ -55,6 +55,8 @@ pub struct Export {
     pub datasets: Vec<DatasetRecord>,
     /// The highest fence that was ever granted.
     pub last_fence: u64,
+    /// The name of the deployment, if it has one.
+    pub deployment: Option<String>,
 }
 
 /// A row of the file.
@@ -76,10 +78,11 @@ enum Row {
     },
     Token(TokenRecord),
     Dataset(DatasetRecord),
+    Deployment(String),
     End {
         jobs: u64,
         taken_requests: u64,
-        /// Marks, quotas, tokens and datasets.
+        /// Marks, quotas, tokens, datasets, and the name of the deployment.
         others: u64,
         last_fence: u64,
     },
@@ -141,6 +144,9 @@ impl Export {
         for dataset in &self.datasets {
             write_row(&mut out, &Row::Dataset(dataset.clone()))?;
         }
+        if let Some(name) = &self.deployment {
+            write_row(&mut out, &Row::Deployment(name.clone()))?;
+        }
         let (jobs, taken_requests, others) = self.counts();
         write_row(&mut out, &Row::End { jobs, taken_requests, others, last_fence: self.last_fence })?;
         out.finish().map(drop)
@@ -148,7 +154,11 @@ impl Export {
 
     /// Jobs, taken requests, and everything else.
     fn counts(&self) -> (u64, u64, u64) {
-        let others = self.marks.len() + self.quotas.len() + self.tokens.len() + self.datasets.len();
+        let others = self.marks.len()
+            + self.quotas.len()
+            + self.tokens.len()
+            + self.datasets.len()
+            + usize::from(self.deployment.is_some());
         (self.jobs.len() as u64, self.taken_requests.len() as u64, others as u64)
     }
 
@@ -179,6 +189,7 @@ impl Export {
                 Row::Quota { tenant, quota } => export.quotas.push((tenant, quota)),
                 Row::Token(token) => export.tokens.push(token),
                 Row::Dataset(dataset) => export.datasets.push(dataset),
+                Row::Deployment(name) => export.deployment = Some(name),
                 Row::End { jobs, taken_requests, others, last_fence } => {
                     let found = export.counts();
                     if found != (jobs, taken_requests, others) {
@@ -273,6 +284,7 @@ pub(crate) fn sample() -> Export {
             .collect(),
         datasets: vec![dataset],
         last_fence: 41,
+        deployment: Some("of the sample".into()),
     }
 }
 

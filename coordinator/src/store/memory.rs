@@ -9,7 +9,7 @@ use tonic::async_trait;
 use super::export::{Export, JobExport};
 use super::{
     AccessStore, Claim, DatasetStore, Grant, JobFilter, JobStore, JobView, Levels, NewJob, OpenWork,
-    ReadyTask, Store, StoreError, StoredEvent, WorkerMark, check_new_dataset, request_key,
+    ReadyTask, Store, StoreError, StoredEvent, WorkerMark, check_new_dataset, new_deployment, request_key,
 };
 use crate::access::TokenRecord;
 use crate::datasets::{DatasetId, DatasetRecord, NewDataset};
@@ -36,6 +36,7 @@ struct State {
     quotas: BTreeMap<Tenant, Quota>,
     tokens: BTreeMap<String, TokenRecord>,
     datasets: BTreeMap<(Tenant, DatasetId), DatasetRecord>,
+    deployment: Option<String>,
     leases: LeaseTable,
 }
 
@@ -491,6 +492,10 @@ impl AccessStore for MemoryStore {
 
 #[async_trait]
 impl Store for MemoryStore {
+    async fn deployment(&self) -> Result<String, StoreError> {
+        Ok(self.lock().deployment.get_or_insert_with(new_deployment).clone())
+    }
+
     async fn export(&self) -> Result<Export, StoreError> {
         let state = self.lock();
         let jobs = state.jobs.iter().map(|(id, rows)| JobExport {
@@ -510,6 +515,7 @@ impl Store for MemoryStore {
             tokens: state.tokens.values().cloned().collect(),
             datasets: state.datasets.values().cloned().collect(),
             last_fence: state.last_fence,
+            deployment: state.deployment.clone(),
         })
     }
 
@@ -532,6 +538,7 @@ impl Store for MemoryStore {
         let datasets = export.datasets.iter().map(|row| ((row.tenant.clone(), row.id.clone()), row.clone()));
         state.datasets.extend(datasets);
         state.last_fence = export.last_fence;
+        state.deployment.clone_from(&export.deployment);
         Ok(())
     }
 }

@@ -287,6 +287,11 @@ pub struct StoredEvent {
     pub body: EventBody,
 }
 
+/// A name for a new deployment.
+pub(crate) fn new_deployment() -> String {
+    uuid::Uuid::new_v4().to_string()
+}
+
 /// Jobs, tasks, leases and workers.
 #[async_trait]
 pub trait JobStore: Send + Sync {
@@ -438,6 +443,9 @@ pub trait AccessStore: Send + Sync {
 /// A whole store. All times are Unix milliseconds of the caller's clock.
 #[async_trait]
 pub trait Store: JobStore + DatasetStore + AccessStore {
+    /// The name of this deployment: random, made by the first call, and part of every export. A bucket with
+    /// its files bears the same name.
+    async fn deployment(&self) -> Result<String, StoreError>;
     /// All data of the store, for a file.
     async fn export(&self) -> Result<Export, StoreError>;
     /// Imports all data of another store; only into an empty one.

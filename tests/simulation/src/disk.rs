@@ -525,6 +525,10 @@ impl AccessStore for DiskStore {
 
 #[async_trait]
 impl Store for DiskStore {
+    async fn deployment(&self) -> Result<String, StoreError> {
+        self.change(|_| true, self.memory.deployment()).await
+    }
+
     async fn export(&self) -> Result<Export, StoreError> {
         self.look(self.memory.export()).await
     }

@@ -255,12 +255,12 @@ async fn a_second_coordinator_is_kept_away_until_the_first_is_gone() {
     let Some(url) = database() else { return };
     let held = || tempfile::tempfile().unwrap();
     let first = PostgresStore::open(&options_of(&url)).await.unwrap();
-    first.hold_alone(held()).await.unwrap();
+    first.hold_alone(Some(held())).await.unwrap();
     let second = PostgresStore::open(&options_of(&url)).await.unwrap();
-    let waits = tokio::time::timeout(Duration::from_millis(1500), second.hold_alone(held())).await;
+    let waits = tokio::time::timeout(Duration::from_millis(1500), second.hold_alone(Some(held()))).await;
     assert!(waits.is_err(), "two coordinators have it");
     drop(first);
-    second.hold_alone(held()).await.unwrap();
+    second.hold_alone(Some(held())).await.unwrap();
     assert_eq!(second.failure(), None);
 }
 

@@ -427,6 +427,10 @@ impl AccessStore for PostgresStore {
 
 #[async_trait]
 impl Store for PostgresStore {
+    async fn deployment(&self) -> Result<String, StoreError> {
+        on!(self.0, pool, |conn| whole::deployment(conn))
+    }
+
     async fn export(&self) -> Result<Export, StoreError> {
         let mut borrowed = self.0.connection().await?;
         let export = whole::export(&mut borrowed.conn).await;

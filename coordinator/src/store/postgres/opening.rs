@@ -122,7 +122,7 @@ impl PostgresStore {
     ///
     /// # Errors
     /// When another one has it, or the database cannot be reached.
-    pub async fn hold_alone(&self, with: File) -> Result<(), StoreError> {
+    pub async fn hold_alone(&self, with: Option<File>) -> Result<(), StoreError> {
         let mut waits_since = None;
         let held = loop {
             if let Some(held) = lock_alone(&self.0.connect).await? {
@@ -194,7 +194,7 @@ async fn lock_alone(connect: &PgConnectOptions) -> Result<Option<PgConnection>, 
 }
 
 /// Takes the lock again when its connection was lost; ends the store if another coordinator was faster.
-async fn watch_alone(store: Weak<Inner>, mut held: PgConnection, _with: File) {
+async fn watch_alone(store: Weak<Inner>, mut held: PgConnection, _with: Option<File>) {
     let mut lost: Option<Instant> = None;
     loop {
         tokio::time::sleep(WATCH_EVERY).await;

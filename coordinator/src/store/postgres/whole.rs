@@ -6,7 +6,7 @@ use sqlx::{Connection, PgConnection};
 
 use super::super::export::{Export, JobExport};
 use super::super::record::{decode, encode};
-use super::super::{StoreError, StoredEvent, WorkerMark, request_key};
+use super::super::{StoreError, StoredEvent, WorkerMark, new_deployment, request_key};
 use super::rows::{EventColumns, LeaseColumns, TaskColumns, number, parse_job, write_job};
 use super::{begin_reading, datasets, tenants, unavailable};
 use crate::schedule::{JobId, TaskRecord};
@@ -64,6 +64,7 @@ async fn read_all(tx: &mut PgConnection) -> Result<Export, StoreError> {
     export.tokens = tenants::tokens(tx).await?;
     export.datasets = datasets::read_page(tx, None, None, usize::MAX).await?;
     export.last_fence = last_fence(tx).await?;
+    export.deployment = named(tx).await?;
     Ok(export)
 }
 
@@ -78,6 +79,27 @@ async fn by_job<T: serde::de::DeserializeOwned>(
         by_job.entry(job).or_default().push(decode(table, &bytes)?);
     }
     Ok(by_job)
+}
+
+/// The name of the deployment, made if it has none.
+pub async fn deployment(conn: &mut PgConnection) -> Result<String, StoreError> {
+    name(conn, &new_deployment()).await?;
+    let name = named(conn).await?;
+    name.ok_or_else(|| StoreError::Failed("the name of the deployment is missing".to_owned()))
+}
+
+async fn named(conn: &mut PgConnection) -> Result<Option<String>, StoreError> {
+    sqlx::query_scalar("SELECT name FROM deployment").fetch_optional(conn).await.map_err(unavailable)
+}
+
+/// Names the deployment unless it has a name.
+async fn name(conn: &mut PgConnection, name: &str) -> Result<(), StoreError> {
+    sqlx::query("INSERT INTO deployment (name) VALUES ($1) ON CONFLICT DO NOTHING")
+        .bind(name)
+        .execute(conn)
+        .await
+        .map(drop)
+        .map_err(unavailable)
 }
 
 async fn last_fence(conn: &mut PgConnection) -> Result<u64, StoreError> {
@@ -173,6 +195,11 @@ pub async fn import(conn: &mut PgConnection, export: &Export) -> Result<(), Stor
     }
     for dataset in &export.datasets {
         datasets::write(&mut tx, dataset).await?;
+    }
+    if let Some(exported) = &export.deployment {
+        // An empty database may have been named when a coordinator tried it.
+        sqlx::query("DELETE FROM deployment").execute(&mut *tx).await.map_err(unavailable)?;
+        name(&mut tx, exported).await?;
     }
     let last = export.last_fence.max(last_fence(&mut tx).await?);
     if last > 0 {

@@ -13,6 +13,7 @@
 //! | `tokens` | id | [`TokenRecord`] |
 //! | `datasets` | tenant, 0, name | [`DatasetRecord`] |
 //! | `meta` | "last_fence" | number |
+//! | `meta` | "deployment" | text |
 //! | `meta` | "written_by" | [`written_by::WrittenBy`], plain JSON |
 //!
 //! Ready and leased tasks are kept in memory ([`Queue`]), built from the rows of open jobs when the store is
@@ -43,13 +44,13 @@ use tonic::async_trait;
 
 use self::live::Live;
 pub(crate) use self::opening::sync_folder;
-use self::rows::{event_key, task_key};
+use self::rows::{DEPLOYMENT, event_key, task_key};
 use super::export::Export;
 use super::flusher::Flusher;
 use super::record::decode;
 use super::{
     AccessStore, Claim, DatasetStore, Grant, JobFilter, JobStore, JobView, Levels, NewJob, Store, StoreError,
-    StoredEvent, WorkerMark,
+    StoredEvent, WorkerMark, new_deployment,
 };
 use crate::access::TokenRecord;
 use crate::datasets::{DatasetId, DatasetRecord, NewDataset};
@@ -397,6 +398,17 @@ impl AccessStore for SledStore {
 
 #[async_trait]
 impl Store for SledStore {
+    async fn deployment(&self) -> Result<String, StoreError> {
+        let meta = &self.trees.meta;
+        if let Some(bytes) = meta.get(DEPLOYMENT).map_err(|error| self.storage_error(error))? {
+            return decode("meta", &bytes);
+        }
+        let name = new_deployment();
+        self.put_alone("meta", meta, DEPLOYMENT, Some(&name))?;
+        self.flusher.sync().await?;
+        Ok(name)
+    }
+
     async fn export(&self) -> Result<Export, StoreError> {
         let rows = self.all_rows()?;
         self.flusher.sync_what_was_read().await?;

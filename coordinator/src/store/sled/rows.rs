@@ -8,6 +8,8 @@ use crate::schedule::{EventBody, JobId, JobRows, TaskId, TaskRecord};
 
 /// Key of the highest granted fence, in `meta`.
 pub const LAST_FENCE: &[u8] = b"last_fence";
+/// Its key in `meta`.
+pub const DEPLOYMENT: &str = "deployment";
 
 /// The same trees inside a transaction.
 pub struct Tx<'a> {

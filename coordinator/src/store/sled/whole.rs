@@ -5,7 +5,7 @@ use sled::{IVec, Tree};
 use super::super::export::{Export, JobExport};
 use super::super::record::decode;
 use super::super::{StoreError, StoredEvent, request_key};
-use super::rows::{LAST_FENCE, event_key, job_of_key, task_key};
+use super::rows::{DEPLOYMENT, LAST_FENCE, event_key, job_of_key, task_key};
 use super::{SledStore, Trees};
 use crate::schedule::{JobId, JobRecord, Quota, TaskRecord, Tenant};
 
@@ -23,6 +23,7 @@ pub(super) struct AllRows {
     tokens: Rows,
     datasets: Rows,
     last_fence: Option<IVec>,
+    deployment: Option<IVec>,
 }
 
 impl SledStore {
@@ -44,6 +45,7 @@ impl SledStore {
             tokens: all(tokens)?,
             datasets: all(datasets)?,
             last_fence: meta.get(LAST_FENCE).map_err(|error| self.storage_error(error))?,
+            deployment: meta.get(DEPLOYMENT).map_err(|error| self.storage_error(error))?,
         })
     }
 
@@ -73,6 +75,9 @@ impl SledStore {
             }
             tx.put("meta", tx.meta, LAST_FENCE, &export.last_fence)
         })?;
+        if let Some(name) = &export.deployment {
+            self.put_alone("meta", &self.trees.meta, DEPLOYMENT, Some(name))?;
+        }
         for (incarnation, mark) in &export.marks {
             self.put_alone("workers", &self.trees.workers, incarnation, Some(mark))?;
         }
@@ -163,6 +168,7 @@ impl AllRows {
         export.tokens = decoded("tokens", &self.tokens)?;
         export.datasets = decoded("datasets", &self.datasets)?;
         export.last_fence = self.last_fence.map(|bytes| decode("meta", &bytes)).transpose()?.unwrap_or(0);
+        export.deployment = self.deployment.map(|bytes| decode("meta", &bytes)).transpose()?;
         Ok(export)
     }
 }

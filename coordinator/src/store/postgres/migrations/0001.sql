@@ -68,6 +68,12 @@ CREATE UNIQUE INDEX leases_by_call ON leases (call);
 
 CREATE SEQUENCE fences;
 
+-- At most one row.
+CREATE TABLE deployment (
+    is_this boolean PRIMARY KEY DEFAULT true CHECK (is_this),
+    name text NOT NULL
+);
+
 CREATE TABLE requests (
     request bytea PRIMARY KEY,
     job_id text COLLATE "C" NOT NULL

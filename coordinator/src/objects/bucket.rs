@@ -1,0 +1,444 @@
+//! Blobs in a bucket: S3, Google Cloud Storage or Azure, by the keys of a folder on the disk.
+//!
+//! Objects cannot be appended to, renamed or touched. So an upload consists of segments (`segments.rs`), and
+//! the last use of a blob is the later of two times: the bucket's own, and one in memory. Ages are hours, so
+//! the bucket's clock is good enough. A client that learned of a blob before the coordinator restarted may
+//! find it gone, and is asked to upload it again.
+
+use std::collections::{BTreeMap, HashMap, HashSet, VecDeque};
+use std::io::Read;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::SystemTime;
+
+use bytes::Bytes;
+use futures::{StreamExt, TryStreamExt};
+use object_store::path::Path as ObjectPath;
+use object_store::{MultipartUpload, ObjectMeta, ObjectStore, ObjectStoreExt};
+
+use super::disk::spawn_io;
+use super::garbage::Removed;
+use super::{ObjectError, check_digest, object_path};
+use crate::clock::Clock;
+
+/// Bytes of a part of an upload; S3 asks for at least 5 MiB.
+pub(super) const PART_BYTES: usize = 8 << 20;
+/// Most parts of one upload; S3 allows 10,000.
+const MOST_PARTS: u64 = 9000;
+/// Objects that are removed while checks wait.
+const REMOVED_AT_ONCE: usize = 100;
+/// Deletions at a time.
+const DELETIONS_AT_ONCE: usize = 16;
+
+/// The blobs of one tenant in a bucket.
+pub(super) struct Bucket {
+    store: Arc<dyn ObjectStore>,
+    /// Whether it is read-only.
+    only_looks: bool,
+    clock: Clock,
+    /// Local folder for files that become blobs.
+    pub staging: PathBuf,
+    /// When blobs were last checked.
+    asked: Mutex<HashMap<String, SystemTime>>,
+    /// Read-locked while a blob is checked or published, write-locked while blobs are removed.
+    publishing: tokio::sync::RwLock<()>,
+}
+
+/// What a bucket holds.
+#[derive(Debug, Default)]
+pub(super) struct Content {
+    /// Bytes of all blobs.
+    pub whole_bytes: u64,
+    /// Bytes of incomplete uploads, by digest.
+    pub uploads: BTreeMap<String, u64>,
+}
+
+impl Bucket {
+    /// The objects of `store`. Files that become blobs are written to `staging` first, which is created.
+    pub fn open(store: Arc<dyn ObjectStore>, staging: PathBuf, clock: Clock) -> Result<Self, ObjectError> {
+        std::fs::create_dir_all(&staging).map_err(super::io_error("create", &staging))?;
+        Ok(Self { only_looks: false, ..Self::existing(store, staging, clock) })
+    }
+
+    /// The same, read-only.
+    pub fn existing(store: Arc<dyn ObjectStore>, staging: PathBuf, clock: Clock) -> Self {
+        Self {
+            store,
+            only_looks: true,
+            clock,
+            staging,
+            asked: Mutex::default(),
+            publishing: Default::default(),
+        }
+    }
+
+    pub fn store(&self) -> &Arc<dyn ObjectStore> {
+        &self.store
+    }
+
+    /// Lists all of it.
+    pub async fn content(&self) -> Result<Content, ObjectError> {
+        let mut content = Content::default();
+        let mut blobs = self.list("cas");
+        while let Some(blob) = blobs.try_next().await? {
+            content.whole_bytes += blob.size;
+        }
+        let mut segments = self.list("uploads");
+        while let Some(segment) = segments.try_next().await? {
+            if let Some(digest) = digest_of_segment(&segment.location) {
+                *content.uploads.entry(digest).or_default() += segment.size;
+            }
+        }
+        Ok(content)
+    }
+
+    /// Objects under a prefix.
+    pub fn list(&self, prefix: &str) -> futures::stream::BoxStream<'static, Result<ObjectMeta, ObjectError>> {
+        self.store.list(Some(&ObjectPath::from(prefix))).map_err(ObjectError::Unavailable).boxed()
+    }
+
+    /// The length of a blob, which is last used now; `None` if there is none.
+    pub async fn ask(&self, digest: &str) -> Result<Option<u64>, ObjectError> {
+        let path = object_path(digest)?;
+        let _nothing_is_removed = self.publishing.read().await;
+        if !self.only_looks {
+            let now = self.clock.system_time();
+            self.asked.lock().unwrap_or_else(PoisonError::into_inner).insert(digest.to_owned(), now);
+        }
+        self.length(&path).await
+    }
+
+    /// The length of an object.
+    pub async fn length(&self, path: &ObjectPath) -> Result<Option<u64>, ObjectError> {
+        match self.store.head(path).await {
+            Ok(meta) => Ok(Some(meta.size)),
+            Err(object_store::Error::NotFound { .. }) => Ok(None),
+            Err(error) => Err(ObjectError::Unavailable(error)),
+        }
+    }
+
+    /// Writes a blob.
+    pub async fn put(&self, digest: &str, bytes: Bytes) -> Result<(), ObjectError> {
+        let _nothing_is_removed = self.publishing.read().await;
+        let path = object_path(digest)?;
+        if bytes.len() <= PART_BYTES {
+            self.store.put(&path, bytes.into()).await.map_err(ObjectError::Unavailable)?;
+            return Ok(());
+        }
+        let mut parts = Parts::begin(&self.store, &path).await?;
+        let size = part_bytes(bytes.len() as u64) as usize;
+        for at in (0..bytes.len()).step_by(size) {
+            parts.put(vec![bytes.slice(at..bytes.len().min(at + size))]).await?;
+        }
+        parts.complete().await
+    }
+
+    /// Uploads a file as a blob, once its bytes have the blob's digest, and removes the file.
+    pub async fn adopt(&self, file: &Path, digest: &str) -> Result<(), ObjectError> {
+        let path = object_path(digest)?;
+        let owned = file.to_owned();
+        let opened = spawn_io(file, move || {
+            let opened = std::fs::File::open(owned)?;
+            let bytes = opened.metadata()?.len();
+            Ok((opened, bytes))
+        });
+        let (mut opened, bytes) = opened.await?;
+        let _nothing_is_removed = self.publishing.read().await;
+        let mut hasher = blake3::Hasher::new();
+        let mut parts = Parts::begin(&self.store, &path).await?;
+        let size = part_bytes(bytes);
+        loop {
+            let read = spawn_io(file, move || {
+                let mut part = Vec::with_capacity(size as usize);
+                (&mut opened).take(size).read_to_end(&mut part)?;
+                Ok((opened, part))
+            });
+            let (still_open, part) = read.await?;
+            if part.is_empty() {
+                break;
+            }
+            opened = still_open;
+            hasher.update(&part);
+            parts.put(vec![part.into()]).await?;
+        }
+        if hasher.finalize().to_hex().as_str() != digest {
+            parts.abort().await;
+            return Err(ObjectError::Damaged(digest.to_owned()));
+        }
+        parts.complete().await?;
+        let owned = file.to_owned();
+        spawn_io(file, move || std::fs::remove_file(owned)).await
+    }
+
+    /// Makes the bytes of segments a blob. The bucket copies a single segment itself. Several are copied
+    /// through the coordinator, and hashed again.
+    pub async fn publish(&self, digest: &str, bytes: u64, from: &[ObjectPath]) -> Result<(), ObjectError> {
+        let path = object_path(digest)?;
+        let _nothing_is_removed = self.publishing.read().await;
+        if let [one] = from {
+            return self.store.copy(one, &path).await.map_err(ObjectError::Unavailable);
+        }
+        let (size, mut part) = (part_bytes(bytes) as usize, Pieces::default());
+        let mut hasher = blake3::Hasher::new();
+        let mut parts = Parts::begin(&self.store, &path).await?;
+        for segment in from {
+            let mut pieces = self.pieces(segment).await?;
+            while let Some(piece) = pieces.try_next().await? {
+                hasher.update(&piece);
+                part.push(piece);
+                while let Some(full) = part.take_part(size) {
+                    parts.put(full).await?;
+                }
+            }
+        }
+        if part.bytes > 0 {
+            parts.put(part.take()).await?;
+        }
+        if hasher.finalize().to_hex().as_str() != digest {
+            parts.abort().await;
+            return Err(ObjectError::Damaged(digest.to_owned()));
+        }
+        parts.complete().await
+    }
+
+    /// All bytes of a blob, of which there are `bytes`.
+    pub async fn read(&self, digest: &str, bytes: u64) -> Result<Bytes, ObjectError> {
+        let path = object_path(digest)?;
+        let mut pieces = self.pieces(&path).await?;
+        let mut whole = match pieces.try_next().await? {
+            Some(piece) if piece.len() as u64 == bytes => return Ok(piece),
+            Some(piece) => Vec::from(piece),
+            None => return Ok(Bytes::new()),
+        };
+        while let Some(piece) = pieces.try_next().await? {
+            whole.extend_from_slice(&piece);
+        }
+        Ok(whole.into())
+    }
+
+    /// The bytes of an object, piece by piece.
+    pub async fn pieces(
+        &self,
+        path: &ObjectPath,
+    ) -> Result<futures::stream::BoxStream<'static, Result<Bytes, ObjectError>>, ObjectError> {
+        let bytes = self.length(path).await?.ok_or_else(|| ObjectError::NotFound(path.to_string()))?;
+        let (store, path) = (Arc::clone(&self.store), path.clone());
+        let starts = (0..bytes).step_by(PART_BYTES);
+        let ranges = futures::stream::iter(starts.map(move |at| at..bytes.min(at + PART_BYTES as u64)));
+        let pieces = ranges.map(move |range| {
+            let (store, path) = (Arc::clone(&store), path.clone());
+            async move { store.get_range(&path, range).await.map_err(ObjectError::Unavailable) }
+        });
+        // The next one travels while this one is used.
+        Ok(pieces.buffered(2).boxed())
+    }
+
+    /// Moves a blob aside if its bytes have another digest; returns its length, or `None` if they have not.
+    pub async fn set_aside_if_damaged(&self, digest: &str) -> Result<Option<u64>, ObjectError> {
+        let path = object_path(digest)?;
+        let (mut hasher, mut bytes) = (blake3::Hasher::new(), 0);
+        let pieces = self.pieces(&path).await;
+        if matches!(pieces, Err(ObjectError::NotFound(_))) {
+            return Ok(None);
+        }
+        let mut pieces = pieces?;
+        while let Some(piece) = pieces.try_next().await? {
+            hasher.update(&piece);
+            bytes += piece.len() as u64;
+        }
+        let found = hasher.finalize().to_hex();
+        if found.as_str() == digest {
+            return Ok(None);
+        }
+        if self.only_looks {
+            return Ok(Some(0));
+        }
+        let aside = ObjectPath::from_iter(["damaged", digest]);
+        let _alone = self.publishing.write().await;
+        match self.store.rename(&path, &aside).await {
+            Ok(()) => {}
+            // Another reader was faster.
+            Err(object_store::Error::NotFound { .. }) => return Ok(None),
+            Err(error) => return Err(ObjectError::Unavailable(error)),
+        }
+        tracing::error!(%digest, %found, %aside, "the bucket has changed a blob; check it");
+        Ok(Some(bytes))
+    }
+
+    /// Removes objects that were last used or written before `before`, except the blobs `used` and the
+    /// uploads that a stream writes. Calls `removed` for each digest of a blob or an upload.
+    pub async fn remove_unused(
+        &self,
+        before: SystemTime,
+        used: &HashSet<String>,
+        is_written: impl Fn(&str) -> bool,
+        mut gone: impl FnMut(Gone<'_>),
+    ) -> Result<Removed, ObjectError> {
+        let mut removed = Removed::default();
+        let is_old = |meta: &ObjectMeta| SystemTime::from(meta.last_modified) < before;
+        for prefix in ["cas", "uploads", "damaged"] {
+            let old = self.list(prefix).try_filter(|meta| std::future::ready(is_old(meta)));
+            let mut batches = old.try_chunks(REMOVED_AT_ONCE);
+            while let Some(batch) = batches.next().await {
+                let batch = batch.map_err(|failed| failed.1)?;
+                let _nobody_asks = self.publishing.write().await;
+                let goes = |meta: &ObjectMeta| match prefix {
+                    "cas" => meta.location.filename().is_some_and(|digest| {
+                        check_digest(digest).is_ok()
+                            && !used.contains(digest)
+                            && !self.is_asked_since(digest, before)
+                    }),
+                    "uploads" => digest_of_segment(&meta.location).is_none_or(|digest| !is_written(&digest)),
+                    _ => true,
+                };
+                let batch: Vec<ObjectMeta> = batch.into_iter().filter(goes).collect();
+                let paths: Vec<ObjectPath> = batch.iter().map(|meta| meta.location.clone()).collect();
+                self.delete(paths).await?;
+                for meta in batch {
+                    let digest = meta.location.filename().unwrap_or_default();
+                    removed.bytes += meta.size;
+                    if prefix == "uploads" {
+                        removed.uploads += 1;
+                        let digest = digest_of_segment(&meta.location).unwrap_or_default();
+                        gone(Gone::Upload { digest: &digest, bytes: meta.size });
+                    } else {
+                        removed.blobs += 1;
+                        if prefix == "cas" {
+                            gone(Gone::Blob { bytes: meta.size });
+                        }
+                    }
+                    tracing::debug!(%digest, prefix, "removed an unused object");
+                }
+            }
+        }
+        let mut asked = self.asked.lock().unwrap_or_else(PoisonError::into_inner);
+        asked.retain(|_, when| *when >= before);
+        Ok(removed)
+    }
+
+    fn is_asked_since(&self, digest: &str, before: SystemTime) -> bool {
+        let asked = self.asked.lock().unwrap_or_else(PoisonError::into_inner);
+        asked.get(digest).is_some_and(|when| *when >= before)
+    }
+
+    /// Deletes objects; those that do not exist count as deleted.
+    pub async fn delete(&self, paths: Vec<ObjectPath>) -> Result<(), ObjectError> {
+        let deletions = futures::stream::iter(paths.into_iter().map(Ok));
+        let delete = |path: ObjectPath| async move {
+            match self.store.delete(&path).await {
+                Ok(()) | Err(object_store::Error::NotFound { .. }) => Ok(()),
+                Err(error) => Err(ObjectError::Unavailable(error)),
+            }
+        };
+        deletions.try_for_each_concurrent(DELETIONS_AT_ONCE, delete).await
+    }
+}
+
+/// What garbage collection has removed.
+pub(super) enum Gone<'a> {
+    /// A blob.
+    Blob {
+        /// Its length.
+        bytes: u64,
+    },
+    /// A part of an upload.
+    Upload {
+        /// Of this blob.
+        digest: &'a str,
+        /// Its length.
+        bytes: u64,
+    },
+}
+
+/// The digest of the upload that a segment belongs to.
+pub(super) fn digest_of_segment(path: &ObjectPath) -> Option<String> {
+    let mut parts = path.parts();
+    parts.next_back()?;
+    let digest = parts.next_back()?.as_ref().to_owned();
+    check_digest(&digest).is_ok().then_some(digest)
+}
+
+fn part_bytes(total: u64) -> u64 {
+    total.div_ceil(MOST_PARTS).max(PART_BYTES as u64)
+}
+
+/// Received bytes that are not written yet.
+#[derive(Default)]
+pub(super) struct Pieces {
+    pieces: VecDeque<Bytes>,
+    pub bytes: usize,
+}
+
+impl Pieces {
+    pub fn push(&mut self, piece: Bytes) {
+        self.bytes += piece.len();
+        self.pieces.push_back(piece);
+    }
+
+    /// A part of exactly `size` bytes, if there are as many: R2 wants parts of one size.
+    pub fn take_part(&mut self, size: usize) -> Option<Vec<Bytes>> {
+        if self.bytes < size {
+            return None;
+        }
+        let (mut part, mut missing) = (Vec::new(), size);
+        while let Some(mut piece) = self.pieces.pop_front() {
+            if piece.len() > missing {
+                self.pieces.push_front(piece.split_off(missing));
+            }
+            missing -= piece.len();
+            part.push(piece);
+            if missing == 0 {
+                break;
+            }
+        }
+        self.bytes -= size;
+        Some(part)
+    }
+
+    /// All that is left.
+    pub fn take(&mut self) -> Vec<Bytes> {
+        self.bytes = 0;
+        std::mem::take(&mut self.pieces).into()
+    }
+}
+
+/// An upload in parts. The object is visible when it is complete.
+pub(super) struct Parts {
+    upload: Box<dyn MultipartUpload>,
+    store: Arc<dyn ObjectStore>,
+    path: ObjectPath,
+    bytes: u64,
+}
+
+impl Parts {
+    pub async fn begin(store: &Arc<dyn ObjectStore>, path: &ObjectPath) -> Result<Self, ObjectError> {
+        let upload = store.put_multipart(path).await.map_err(ObjectError::Unavailable)?;
+        Ok(Self { upload, store: Arc::clone(store), path: path.clone(), bytes: 0 })
+    }
+
+    pub async fn put(&mut self, part: Vec<Bytes>) -> Result<(), ObjectError> {
+        self.bytes += part.iter().map(|piece| piece.len() as u64).sum::<u64>();
+        let put = self.upload.put_part(part.into_iter().collect()).await.map_err(ObjectError::Unavailable);
+        if put.is_err() {
+            self.abort().await;
+        }
+        put
+    }
+
+    pub async fn complete(mut self) -> Result<(), ObjectError> {
+        let Err(error) = self.upload.complete().await else { return Ok(()) };
+        // If an answer is lost, the request is repeated, and then there is no such upload any more. The key
+        // belongs to these bytes alone, so the object tells.
+        match self.store.head(&self.path).await {
+            Ok(meta) if meta.size == self.bytes => Ok(()),
+            _ => Err(ObjectError::Unavailable(error)),
+        }
+    }
+
+    /// Gives it up. If that fails, the bucket's rules for incomplete uploads remove its parts.
+    pub async fn abort(&mut self) {
+        if let Err(error) = self.upload.abort().await {
+            tracing::warn!(%error, "the parts of an upload remain in the bucket");
+        }
+    }
+}
