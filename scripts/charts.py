@@ -39,7 +39,8 @@ ENGINES = ["database.secret=database", "objects.url=s3://reef/fathom", "objects.
 # Settings that must pass.
 SOUND = {
     "in one namespace, plain text": OPEN,
-    "safe": SAFE,
+    "before workers have a token": ["coordinator.tlsSecret=tls"],
+    "safe": SAFE + ["networkPolicy.clientCidrs={10.0.0.0/8}"],
     "database and bucket": SAFE + ENGINES,
     "KEDA": SAFE + ENGINES + KEDA + ["workers.pools[0].name=large", "workers.pools[0].aboveMib=8000", "imagePullSecrets={one,two}"],
     "KEDA in plain text": OPEN + ["keda.enabled=true", "networkPolicy.enabled=false", "workers.runtimeClassName="],
@@ -47,7 +48,7 @@ SOUND = {
 # Settings that must be refused, and a part of the sentence.
 REFUSED = {
     "coordinator.tlsSecret and coordinator.tokens": [],
-    "fathom token issue": ["coordinator.tlsSecret=tls"],
+    "/networkPolicy/clientCidrs": OPEN + ["networkPolicy.clientCidrs={10.0.0.1}"],
     "keda.clientSecret": SAFE + ["keda.enabled=true"],
     "needs coordinator.tlsSecret": OPEN + KEDA,
     "replicaz": OPEN + ["workers.pools[0].name=gpu", "workers.pools[0].replicaz=3"],
@@ -183,6 +184,9 @@ def check_chart():
                 check_kubernetes(document, where)
         if of_keda:
             check_keda(of_keda, tools, where)
+        has_workers = any(document["metadata"]["name"] == "reef-fathom-gpu" for document in documents)
+        if has_workers == (pairs == ["coordinator.tlsSecret=tls"]) and "large" not in str(pairs):
+            fail(f"the chart ({where}) starts {'' if has_workers else 'no '}workers")
         if bool(of_keda) != any(pair == "keda.enabled=true" for pair in pairs):
             fail(f"the chart ({where}) has {len(of_keda)} objects of KEDA")
     for sentence, pairs in REFUSED.items():

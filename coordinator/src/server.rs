@@ -40,7 +40,7 @@ use crate::retention::{Housekeeping, Policy, RetentionError, collect, collect_ga
 use crate::scaler;
 use crate::services::{Admin, Jobs, Uploads, Workers, logs, release_disowned};
 use crate::state::{State, stopped};
-use crate::store::{PostgresOptions, PostgresStore, SledOptions, SledStore, Store};
+use crate::store::{PostgresOptions, PostgresStore, SledOptions, SledStore, Store, StoreError};
 use crate::sweep::sweep_leases;
 use crate::tls::Tls;
 use crate::wakeups::Wakeups;
@@ -58,6 +58,8 @@ pub const MAX_UPLOAD_MESSAGE_BYTES: usize = 12 << 20;
 const MAX_CALLS_OF_A_CONNECTION: u32 = 1024;
 /// Time that open calls have to end when the coordinator stops.
 const STOP_WITHIN: Duration = Duration::from_secs(5);
+/// Pause between two readings of a database's tokens: a revoked one is refused within two seconds.
+const READ_TOKENS_EVERY: Duration = Duration::from_secs(1);
 
 /// A running coordinator.
 pub struct Coordinator {
@@ -160,7 +162,7 @@ pub async fn serve(config: CoordinatorConfig) -> Result<Coordinator, Coordinator
     data_dir::make(&config.data_dir)?;
     let at = ObjectsAt::parse(config.objects.as_deref(), &config.data_dir)?;
     let store = open_store(&config).await?;
-    at.hold_for(&store.deployment().await?).await?;
+    at.hold_for(&store.deployment().await?, &config.data_dir).await?;
     let objects = TenantBlobs::open(at, &config.data_dir, config.min_free_bytes, clock).await?;
     let house = config.housekeeping();
     let room = Room::of_this_process();
@@ -313,6 +315,9 @@ where
             () = calls.watch(access, clock) => {}
         }
     });
+    if config.store.is_some() {
+        tokio::spawn(read_tokens(Arc::clone(&shared)));
+    }
     let guard = GuardLayer(Arc::new(guard));
     let incoming = connections.of(incoming);
     let running = match tls {
@@ -329,6 +334,24 @@ where
         }
     };
     Ok(Coordinator { address, metrics_address, scaler_address: None, scheme, stopping, running, shared })
+}
+
+/// Reads the tokens of a database again at intervals, until the coordinator stops: other processes write them
+/// too.
+async fn read_tokens(shared: Arc<State>) {
+    let mut stopping = shared.stopping.clone();
+    loop {
+        tokio::select! {
+            biased;
+            () = stopped(&mut stopping) => return,
+            () = tokio::time::sleep(READ_TOKENS_EVERY) => {}
+        }
+        match shared.access.read_again(shared.store.as_ref()).await {
+            // The sweeper reports an outage.
+            Ok(()) | Err(StoreError::Unavailable(_)) => {}
+            Err(error) => tracing::error!(%error, "cannot read the tokens; those that are known stay valid"),
+        }
+    }
 }
 
 async fn listen(listen: SocketAddr) -> Result<(TcpListener, SocketAddr), CoordinatorError> {

@@ -287,6 +287,7 @@ impl From<ServiceError> for Status {
                     (Code::DataLoss, "DIGEST_MISMATCH")
                 }
                 ObjectError::Busy(_) => (Code::Aborted, "WRITE_IN_PROGRESS"),
+                ObjectError::Interrupted => (Code::Unavailable, "STORE_UNAVAILABLE"),
                 ObjectError::OverLimit { .. } => (Code::ResourceExhausted, "QUOTA_SPENT"),
                 ObjectError::LowSpace { .. } => (Code::ResourceExhausted, "LOW_DISK_SPACE"),
                 ObjectError::Unavailable(_) => {

@@ -2,8 +2,9 @@
 
 use std::path::{Path, PathBuf};
 use std::process::{Output, Stdio};
+use std::time::{Duration, Instant};
 
-use crate::processes::{Service, fail, free_port, json, output_in, succeed, tiny_scene, under};
+use crate::processes::{Service, fail, free_port, json, output_in, output_of, succeed, tiny_scene, under};
 
 /// The largest object file of a data directory.
 fn largest_object(data: &Path) -> PathBuf {
@@ -196,4 +197,21 @@ fn a_service_moves_to_a_database_and_a_bucket_and_back() {
     moved(&[&there[..], &["--to-data-dir", &back]].concat());
     assert_eq!(submit(&["--data-dir", &back]), job, "a repeated request made another job");
     succeed(&["store", "verify", "--data-dir", &back, "--deep"]);
+}
+
+#[test]
+fn a_token_that_is_written_into_the_database_counts_at_once() {
+    let Some(database) = crate::postgres::database() else { return };
+    let folder = tempfile::tempdir().expect("a folder");
+    let at = |name: &str| under(folder.path(), name);
+    let store = format!("--store={database}");
+    let flags = ["--data-dir", &at("data"), "--listen=127.0.0.1:0", "--tokens", &store];
+    let (_coordinator, url) = Service::coordinator_with(&flags);
+    let token = succeed(&["token", "issue", "ana", "--role=viewer", "--tenant=reef", &store]);
+    std::fs::write(at("ana.token"), token).expect("written");
+    let begin = Instant::now();
+    while !output_of(&["ls", "--coordinator", &url, "--token-file", &at("ana.token")]).status.success() {
+        assert!(begin.elapsed() < Duration::from_secs(10), "the coordinator does not know the token");
+        std::thread::sleep(Duration::from_millis(100));
+    }
 }

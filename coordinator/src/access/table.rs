@@ -1,6 +1,7 @@
 //! All tokens in memory, because every call needs them.
 
 use std::collections::HashMap;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{PoisonError, RwLock};
 use std::time::Duration;
 
@@ -8,11 +9,14 @@ use tokio::sync::watch;
 
 use super::{Principal, Token, TokenRecord};
 use crate::clock::Clock;
+use crate::store::{AccessStore, StoreError};
 
 /// The tokens. They are also stored; the store is written first.
 pub struct Access {
     /// By id; `None` where no tokens are required.
     tokens: Option<RwLock<HashMap<String, TokenRecord>>>,
+    /// Counts the tokens that this process stored.
+    noted: AtomicU64,
     /// Moves when one of them changes.
     changes: watch::Sender<()>,
 }
@@ -37,7 +41,7 @@ pub enum Refused {
 impl Access {
     /// For a coordinator without tokens.
     pub fn open() -> Self {
-        Self { tokens: None, changes: watch::channel(()).0 }
+        Self { tokens: None, noted: AtomicU64::new(0), changes: watch::channel(()).0 }
     }
 
     /// For a coordinator that requires one of `tokens`.
@@ -109,16 +113,40 @@ impl Access {
     /// Records a stored token.
     pub fn note(&self, token: TokenRecord) {
         if let Some(tokens) = &self.tokens {
-            tokens.write().unwrap_or_else(PoisonError::into_inner).insert(token.id.clone(), token);
+            let mut tokens = tokens.write().unwrap_or_else(PoisonError::into_inner);
+            self.noted.fetch_add(1, Ordering::Relaxed);
+            tokens.insert(token.id.clone(), token);
             self.changes.send_replace(());
         }
+    }
+
+    /// Reads all tokens again, which another process may have written.
+    ///
+    /// # Errors
+    /// When they cannot be read; those that are known stay.
+    pub async fn read_again(&self, store: &dyn AccessStore) -> Result<(), StoreError> {
+        let Some(tokens) = &self.tokens else { return Ok(()) };
+        let noted = self.noted.load(Ordering::Relaxed);
+        let read: HashMap<String, TokenRecord> =
+            store.tokens().await?.into_iter().map(|token| (token.id.clone(), token)).collect();
+        let mut tokens = tokens.write().unwrap_or_else(PoisonError::into_inner);
+        // What was read may be older than a token that this process has just revoked.
+        if noted == self.noted.load(Ordering::Relaxed) && *tokens != read {
+            *tokens = read;
+            self.changes.send_replace(());
+        }
+        Ok(())
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use tonic::async_trait;
+
     use super::*;
     use crate::access::Role;
+    use crate::schedule::{Quota, Rules, Tenant, Usage};
+    use crate::store::MemoryStore;
 
     #[test]
     fn only_a_valid_token_is_admitted() {
@@ -166,6 +194,68 @@ mod tests {
         assert!(tokio::time::timeout(soon, second).await.is_ok(), "it has expired");
         let anonymous = Principal::anonymous();
         assert!(tokio::time::timeout(waits, access.until_void(&anonymous, clock)).await.is_err());
+    }
+
+    #[tokio::test]
+    async fn tokens_of_another_process_count_and_a_revocation_stays() {
+        let store = MemoryStore::new(Rules::default(), 1000, 0);
+        let access = Access::by_tokens(Vec::new());
+        let token = Token::random();
+        let record = TokenRecord::new(&token, "ci".into(), Role::Viewer, None, 0, None);
+        let shown = format!("Bearer {}", token.reveal());
+        store.put_token(&record).await.unwrap();
+        assert_eq!(access.principal(Some(&shown), 1), Err(Refused::NotValid));
+        access.read_again(&store).await.unwrap();
+        let caller = access.principal(Some(&shown), 1).unwrap();
+        let changes = access.changes.subscribe();
+        access.read_again(&store).await.unwrap();
+        assert!(!changes.has_changed().unwrap(), "callers wake although nothing has changed");
+
+        // This process revokes it while it reads what was before.
+        let revoked = TokenRecord { revoked_ms: Some(2), ..record };
+        let slow = Slow { store: &store, access: &access, revoked: &revoked };
+        access.read_again(&slow).await.unwrap();
+        assert!(!access.still_holds(&caller, 3), "a revocation was undone");
+        store.put_token(&revoked).await.unwrap();
+        access.read_again(&store).await.unwrap();
+        assert!(!access.still_holds(&caller, 3));
+        assert!(changes.has_changed().unwrap());
+    }
+
+    /// A store whose answer comes after a revocation, and is from before it.
+    struct Slow<'a> {
+        store: &'a MemoryStore,
+        access: &'a Access,
+        revoked: &'a TokenRecord,
+    }
+
+    #[async_trait]
+    impl AccessStore for Slow<'_> {
+        async fn tokens(&self) -> Result<Vec<TokenRecord>, StoreError> {
+            let tokens = self.store.tokens().await;
+            self.access.note(self.revoked.clone());
+            tokens
+        }
+
+        async fn set_quota(&self, tenant: &Tenant, quota: Option<Quota>) -> Result<(), StoreError> {
+            self.store.set_quota(tenant, quota).await
+        }
+
+        async fn quota(&self, tenant: &Tenant) -> Result<Quota, StoreError> {
+            self.store.quota(tenant).await
+        }
+
+        async fn quotas(&self) -> Result<Vec<(Tenant, Quota)>, StoreError> {
+            self.store.quotas().await
+        }
+
+        async fn usage(&self) -> Result<Vec<(Tenant, Usage)>, StoreError> {
+            self.store.usage().await
+        }
+
+        async fn put_token(&self, token: &TokenRecord) -> Result<(), StoreError> {
+            self.store.put_token(token).await
+        }
     }
 
     #[test]

@@ -17,7 +17,7 @@ use crate::data_dir;
 use crate::error::CoordinatorError;
 use crate::objects::{BlobStore, ObjectError, ObjectsAt, TenantBlobs};
 use crate::store::export::Export;
-use crate::store::{SledStore, Store, new_deployment};
+use crate::store::{SledStore, Store};
 
 /// Blobs that are copied at a time.
 const BLOBS_AT_ONCE: usize = 8;
@@ -53,14 +53,16 @@ pub async fn move_service(
     to: &Place,
 ) -> Result<Moved, CoordinatorError> {
     let (from_objects, to_objects) = (objects_of(from)?, objects_of(to)?);
-    let mut source = read_source(from, scratch).await?;
+    let source = read_source(from, scratch).await?;
     data_dir::make(&to.data_dir)?;
     let mut moved = Moved::default();
     if !is_same(&from_objects, &to_objects) {
-        if let ObjectsAt::Bucket { .. } = to_objects {
-            let name = source.export.deployment.get_or_insert_with(new_deployment);
-            to_objects.hold_for(name).await?;
-        }
+        let Some(name) = &source.export.deployment else {
+            return Err(CoordinatorError::Maintenance(format!(
+                "the jobs in {from} are of a coordinator of an earlier version; start it once with this version, and stop it again"
+            )));
+        };
+        to_objects.hold_for(name, &to.data_dir).await?;
         copy_objects(&source.export, &from_objects, to_objects, &to.data_dir, &mut moved).await?;
     }
     if from.data_dir != to.data_dir {

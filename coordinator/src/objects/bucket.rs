@@ -30,6 +30,12 @@ const REMOVED_AT_ONCE: usize = 100;
 /// Deletions at a time.
 const DELETIONS_AT_ONCE: usize = 16;
 
+/// Longest damaged blob that is kept for an analysis.
+const MOST_KEPT_BYTES: u64 = 1 << 30;
+
+/// The bytes of an object.
+type PieceStream = futures::stream::BoxStream<'static, Result<Bytes, ObjectError>>;
+
 /// The blobs of one tenant in a bucket.
 pub(super) struct Bucket {
     store: Arc<dyn ObjectStore>,
@@ -40,8 +46,11 @@ pub(super) struct Bucket {
     pub staging: PathBuf,
     /// When blobs were last checked.
     asked: Mutex<HashMap<String, SystemTime>>,
-    /// Read-locked while a blob is checked or published, write-locked while blobs are removed.
-    publishing: tokio::sync::RwLock<()>,
+    /// Read-locked while a blob is checked, write-locked while blobs are removed. Whoever publishes a blob
+    /// has found it missing before, and gives it a new time, so garbage collection does not take it for old.
+    checking: tokio::sync::RwLock<()>,
+    /// Held during the whole check of a possibly damaged blob: a new upload may replace it.
+    looking: tokio::sync::Mutex<()>,
 }
 
 /// What a bucket holds.
@@ -68,7 +77,8 @@ impl Bucket {
             clock,
             staging,
             asked: Mutex::default(),
-            publishing: Default::default(),
+            checking: Default::default(),
+            looking: Default::default(),
         }
     }
 
@@ -100,18 +110,18 @@ impl Bucket {
     /// The length of a blob, which is last used now; `None` if there is none.
     pub async fn ask(&self, digest: &str) -> Result<Option<u64>, ObjectError> {
         let path = object_path(digest)?;
-        let _nothing_is_removed = self.publishing.read().await;
+        let _nothing_is_removed = self.checking.read().await;
         if !self.only_looks {
             let now = self.clock.system_time();
             self.asked.lock().unwrap_or_else(PoisonError::into_inner).insert(digest.to_owned(), now);
         }
-        self.length(&path).await
+        Ok(self.head(&path).await?.map(|meta| meta.size))
     }
 
-    /// The length of an object.
-    pub async fn length(&self, path: &ObjectPath) -> Result<Option<u64>, ObjectError> {
+    /// What is known of an object; `None` if there is none.
+    async fn head(&self, path: &ObjectPath) -> Result<Option<ObjectMeta>, ObjectError> {
         match self.store.head(path).await {
-            Ok(meta) => Ok(Some(meta.size)),
+            Ok(meta) => Ok(Some(meta)),
             Err(object_store::Error::NotFound { .. }) => Ok(None),
             Err(error) => Err(ObjectError::Unavailable(error)),
         }
@@ -119,7 +129,6 @@ impl Bucket {
 
     /// Writes a blob.
     pub async fn put(&self, digest: &str, bytes: Bytes) -> Result<(), ObjectError> {
-        let _nothing_is_removed = self.publishing.read().await;
         let path = object_path(digest)?;
         if bytes.len() <= PART_BYTES {
             self.store.put(&path, bytes.into()).await.map_err(ObjectError::Unavailable)?;
@@ -143,7 +152,6 @@ impl Bucket {
             Ok((opened, bytes))
         });
         let (mut opened, bytes) = opened.await?;
-        let _nothing_is_removed = self.publishing.read().await;
         let mut hasher = blake3::Hasher::new();
         let mut parts = Parts::begin(&self.store, &path).await?;
         let size = part_bytes(bytes);
@@ -174,7 +182,6 @@ impl Bucket {
     /// through the coordinator, and hashed again.
     pub async fn publish(&self, digest: &str, bytes: u64, from: &[ObjectPath]) -> Result<(), ObjectError> {
         let path = object_path(digest)?;
-        let _nothing_is_removed = self.publishing.read().await;
         if let [one] = from {
             return self.store.copy(one, &path).await.map_err(ObjectError::Unavailable);
         }
@@ -217,11 +224,12 @@ impl Bucket {
     }
 
     /// The bytes of an object, piece by piece.
-    pub async fn pieces(
-        &self,
-        path: &ObjectPath,
-    ) -> Result<futures::stream::BoxStream<'static, Result<Bytes, ObjectError>>, ObjectError> {
-        let bytes = self.length(path).await?.ok_or_else(|| ObjectError::NotFound(path.to_string()))?;
+    pub async fn pieces(&self, path: &ObjectPath) -> Result<PieceStream, ObjectError> {
+        let meta = self.head(path).await?.ok_or_else(|| ObjectError::NotFound(path.to_string()))?;
+        Ok(self.pieces_of(path, meta.size))
+    }
+
+    fn pieces_of(&self, path: &ObjectPath, bytes: u64) -> PieceStream {
         let (store, path) = (Arc::clone(&self.store), path.clone());
         let starts = (0..bytes).step_by(PART_BYTES);
         let ranges = futures::stream::iter(starts.map(move |at| at..bytes.min(at + PART_BYTES as u64)));
@@ -230,21 +238,18 @@ impl Bucket {
             async move { store.get_range(&path, range).await.map_err(ObjectError::Unavailable) }
         });
         // The next one travels while this one is used.
-        Ok(pieces.buffered(2).boxed())
+        pieces.buffered(2).boxed()
     }
 
     /// Moves a blob aside if its bytes have another digest; returns its length, or `None` if they have not.
     pub async fn set_aside_if_damaged(&self, digest: &str) -> Result<Option<u64>, ObjectError> {
         let path = object_path(digest)?;
-        let (mut hasher, mut bytes) = (blake3::Hasher::new(), 0);
-        let pieces = self.pieces(&path).await;
-        if matches!(pieces, Err(ObjectError::NotFound(_))) {
-            return Ok(None);
-        }
-        let mut pieces = pieces?;
+        let _alone = self.looking.lock().await;
+        let Some(before) = self.head(&path).await? else { return Ok(None) };
+        let mut hasher = blake3::Hasher::new();
+        let mut pieces = self.pieces_of(&path, before.size);
         while let Some(piece) = pieces.try_next().await? {
             hasher.update(&piece);
-            bytes += piece.len() as u64;
         }
         let found = hasher.finalize().to_hex();
         if found.as_str() == digest {
@@ -253,67 +258,96 @@ impl Bucket {
         if self.only_looks {
             return Ok(Some(0));
         }
-        let aside = ObjectPath::from_iter(["damaged", digest]);
-        let _alone = self.publishing.write().await;
-        match self.store.rename(&path, &aside).await {
-            Ok(()) => {}
-            // Another reader was faster.
-            Err(object_store::Error::NotFound { .. }) => return Ok(None),
-            Err(error) => return Err(ObjectError::Unavailable(error)),
+        let _nobody_asks = self.checking.write().await;
+        // It may have been sent again meanwhile.
+        let is_same = |now: &ObjectMeta| {
+            (now.last_modified, &now.e_tag, now.size) == (before.last_modified, &before.e_tag, before.size)
+        };
+        if !self.head(&path).await?.is_some_and(|now| is_same(&now)) {
+            return Ok(None);
         }
-        tracing::error!(%digest, %found, %aside, "the bucket has changed a blob; check it");
-        Ok(Some(bytes))
+        // Buckets copy no object of more than 5 GB, and a long copy takes longer than a request may.
+        let aside = ObjectPath::from_iter(["damaged", digest]);
+        if before.size <= MOST_KEPT_BYTES {
+            self.store.copy(&path, &aside).await.map_err(ObjectError::Unavailable)?;
+            tracing::error!(%digest, %found, %aside, "the bucket has changed a blob; check it");
+        } else {
+            tracing::error!(%digest, %found, bytes = before.size, "the bucket has changed a blob, which is too long to be kept");
+        }
+        self.delete(vec![path], |_| ()).await?;
+        Ok(Some(before.size))
     }
 
     /// Removes objects that were last used or written before `before`, except the blobs `used` and the
-    /// uploads that a stream writes. Calls `removed` for each digest of a blob or an upload.
+    /// uploads that a stream writes. Calls `gone` for each.
     pub async fn remove_unused(
         &self,
         before: SystemTime,
         used: &HashSet<String>,
         is_written: impl Fn(&str) -> bool,
-        mut gone: impl FnMut(Gone<'_>),
+        gone: impl Fn(Gone<'_>),
     ) -> Result<Removed, ObjectError> {
-        let mut removed = Removed::default();
+        let removed = Mutex::new(Removed::default());
+        let counted = |of: Gone<'_>| {
+            let mut removed = removed.lock().unwrap_or_else(PoisonError::into_inner);
+            match &of {
+                Gone::Blob { bytes } | Gone::Damaged { bytes } => {
+                    removed.blobs += 1;
+                    removed.bytes += bytes;
+                }
+                Gone::Upload { bytes, .. } => {
+                    removed.uploads += 1;
+                    removed.bytes += bytes;
+                }
+            }
+            gone(of);
+        };
         let is_old = |meta: &ObjectMeta| SystemTime::from(meta.last_modified) < before;
-        for prefix in ["cas", "uploads", "damaged"] {
+        for prefix in ["cas", "damaged"] {
             let old = self.list(prefix).try_filter(|meta| std::future::ready(is_old(meta)));
             let mut batches = old.try_chunks(REMOVED_AT_ONCE);
             while let Some(batch) = batches.next().await {
-                let batch = batch.map_err(|failed| failed.1)?;
-                let _nobody_asks = self.publishing.write().await;
-                let goes = |meta: &ObjectMeta| match prefix {
-                    "cas" => meta.location.filename().is_some_and(|digest| {
-                        check_digest(digest).is_ok()
-                            && !used.contains(digest)
-                            && !self.is_asked_since(digest, before)
-                    }),
-                    "uploads" => digest_of_segment(&meta.location).is_none_or(|digest| !is_written(&digest)),
-                    _ => true,
-                };
-                let batch: Vec<ObjectMeta> = batch.into_iter().filter(goes).collect();
-                let paths: Vec<ObjectPath> = batch.iter().map(|meta| meta.location.clone()).collect();
-                self.delete(paths).await?;
-                for meta in batch {
-                    let digest = meta.location.filename().unwrap_or_default();
-                    removed.bytes += meta.size;
-                    if prefix == "uploads" {
-                        removed.uploads += 1;
-                        let digest = digest_of_segment(&meta.location).unwrap_or_default();
-                        gone(Gone::Upload { digest: &digest, bytes: meta.size });
-                    } else {
-                        removed.blobs += 1;
-                        if prefix == "cas" {
-                            gone(Gone::Blob { bytes: meta.size });
-                        }
-                    }
-                    tracing::debug!(%digest, prefix, "removed an unused object");
+                let mut batch = batch.map_err(|failed| failed.1)?;
+                let _nobody_asks = self.checking.write().await;
+                if prefix == "cas" {
+                    batch.retain(|meta| {
+                        meta.location.filename().is_some_and(|digest| {
+                            check_digest(digest).is_ok()
+                                && !used.contains(digest)
+                                && !self.is_asked_since(digest, before)
+                        })
+                    });
                 }
+                let sizes: HashMap<ObjectPath, u64> =
+                    batch.into_iter().map(|meta| (meta.location, meta.size)).collect();
+                let report = |path: &ObjectPath| {
+                    let bytes = sizes.get(path).copied().unwrap_or(0);
+                    counted(if prefix == "cas" { Gone::Blob { bytes } } else { Gone::Damaged { bytes } });
+                };
+                self.delete(sizes.keys().cloned().collect(), report).await?;
             }
+        }
+        // An upload is as young as its youngest segment.
+        let mut uploads = BTreeMap::<String, Vec<ObjectMeta>>::new();
+        let mut segments = self.list("uploads");
+        while let Some(segment) = segments.try_next().await? {
+            uploads
+                .entry(digest_of_segment(&segment.location).unwrap_or_default())
+                .or_default()
+                .push(segment);
+        }
+        for (digest, segments) in uploads {
+            if !segments.iter().all(is_old) || is_written(&digest) {
+                continue;
+            }
+            let bytes = segments.iter().map(|segment| segment.size).sum();
+            self.delete(segments.into_iter().map(|segment| segment.location).collect(), |_| ()).await?;
+            counted(Gone::Upload { digest: &digest, bytes });
         }
         let mut asked = self.asked.lock().unwrap_or_else(PoisonError::into_inner);
         asked.retain(|_, when| *when >= before);
-        Ok(removed)
+        drop(asked);
+        Ok(removed.into_inner().unwrap_or_else(PoisonError::into_inner))
     }
 
     fn is_asked_since(&self, digest: &str, before: SystemTime) -> bool {
@@ -321,16 +355,28 @@ impl Bucket {
         asked.get(digest).is_some_and(|when| *when >= before)
     }
 
-    /// Deletes objects; those that do not exist count as deleted.
-    pub async fn delete(&self, paths: Vec<ObjectPath>) -> Result<(), ObjectError> {
-        let deletions = futures::stream::iter(paths.into_iter().map(Ok));
-        let delete = |path: ObjectPath| async move {
-            match self.store.delete(&path).await {
-                Ok(()) | Err(object_store::Error::NotFound { .. }) => Ok(()),
-                Err(error) => Err(ObjectError::Unavailable(error)),
+    /// Deletes objects, and calls `gone` for each that was deleted. Those that do not exist count as deleted.
+    pub async fn delete(
+        &self,
+        paths: Vec<ObjectPath>,
+        gone: impl Fn(&ObjectPath),
+    ) -> Result<(), ObjectError> {
+        let mut deletions = futures::stream::iter(paths)
+            .map(|path| async move {
+                match self.store.delete(&path).await {
+                    Ok(()) | Err(object_store::Error::NotFound { .. }) => Ok(path),
+                    Err(error) => Err(ObjectError::Unavailable(error)),
+                }
+            })
+            .buffer_unordered(DELETIONS_AT_ONCE);
+        let mut failed = Ok(());
+        while let Some(deleted) = deletions.next().await {
+            match deleted {
+                Ok(path) => gone(&path),
+                Err(error) => failed = Err(error),
             }
-        };
-        deletions.try_for_each_concurrent(DELETIONS_AT_ONCE, delete).await
+        }
+        failed
     }
 }
 
@@ -341,7 +387,12 @@ pub(super) enum Gone<'a> {
         /// Its length.
         bytes: u64,
     },
-    /// A part of an upload.
+    /// A damaged blob that was set aside.
+    Damaged {
+        /// Its length.
+        bytes: u64,
+    },
+    /// An upload.
     Upload {
         /// Of this blob.
         digest: &'a str,

@@ -228,7 +228,7 @@ async fn old_objects_are_removed_unless_used_or_checked() {
     }
     running.pause().await.unwrap();
     let removed = store.remove_unused(SystemTime::now() + DAY, kept).await.unwrap();
-    assert_eq!((removed.blobs, removed.uploads), (2, 2));
+    assert_eq!((removed.blobs, removed.uploads), (2, 1));
     assert_eq!(store.committed(&BlobRef::of(&half)).await.unwrap(), (0, false), "it restarts");
     assert_eq!(store.used_bytes(), 4);
 }
@@ -251,9 +251,9 @@ async fn tenants_are_apart_and_found_again() {
 async fn a_bucket_serves_one_deployment_only() {
     let server = S3Server::start();
     let place = at(&server);
-    place.hold_for("one").await.unwrap();
-    place.hold_for("one").await.unwrap();
-    let refused = place.hold_for("other").await.unwrap_err().to_string();
+    place.hold_for("one", Path::new("data")).await.unwrap();
+    place.hold_for("one", Path::new("data")).await.unwrap();
+    let refused = place.hold_for("other", Path::new("data")).await.unwrap_err().to_string();
     assert!(
         refused.contains("s3://reef/scenes has the files of another deployment (one, this is other)"),
         "{refused}"
@@ -314,4 +314,62 @@ async fn an_outage_of_the_bucket_is_no_failed_attempt() {
     assert!(OwnTaskError::from(error).is_outage);
     server.break_every(1, None);
     assert!(!opened(store, BlobRef::of(b"never sent")).await.is_outage, "a missing file is no outage");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_client_that_leaves_while_a_part_travels_loses_nothing() {
+    let (server, dir) = (S3Server::start(), tempfile::tempdir().unwrap());
+    let store = opened(&server, dir.path()).await;
+    let content = content(2 * PART_BYTES + 10);
+    let blob = BlobRef::of(&content);
+    let mut writer = send(&store, &content, 0, PART_BYTES - 5).await;
+    server.break_every(1, Some(Fault::Slow(Duration::from_millis(300))));
+    let piece = Bytes::copy_from_slice(&content[PART_BYTES - 5..PART_BYTES + 7]);
+    let append = writer.append((PART_BYTES - 5) as u64, piece);
+    assert!(
+        tokio::time::timeout(Duration::from_millis(100), append).await.is_err(),
+        "the part is there already"
+    );
+    drop(writer);
+    assert!(matches!(store.begin_write(&blob, 0, None).await, Err(ObjectError::Busy(_))));
+    server.break_every(1, None);
+    while matches!(store.begin_write(&blob, 1, None).await, Err(ObjectError::Busy(_))) {
+        tokio::time::sleep(Duration::from_millis(5)).await;
+    }
+    let arrived = PART_BYTES + 7;
+    assert_eq!(store.committed(&blob).await.unwrap(), (arrived as u64, false));
+    send(&store, &content, arrived, content.len()).await.finish().await.unwrap();
+    assert!(store.read(&blob).await.unwrap() == content);
+}
+
+#[test]
+fn a_process_may_end_in_the_middle_of_an_upload() {
+    let (server, dir) = (S3Server::start(), tempfile::tempdir().unwrap());
+    let content = content(2 * PART_BYTES);
+    let runtime = tokio::runtime::Runtime::new().unwrap();
+    let (writer, store) = runtime.block_on(async {
+        let store = opened(&server, dir.path()).await;
+        (send(&store, &content, 0, PART_BYTES + 100).await, store)
+    });
+    drop(runtime);
+    drop(writer);
+    drop(store);
+    let runtime = tokio::runtime::Runtime::new().unwrap();
+    runtime.block_on(async {
+        let store = opened(&server, dir.path()).await;
+        let (arrived, _) = store.committed(&BlobRef::of(&content)).await.unwrap();
+        send(&store, &content, arrived as usize, content.len()).await.finish().await.unwrap();
+        assert!(store.read(&BlobRef::of(&content)).await.unwrap() == content);
+    });
+}
+
+#[tokio::test]
+async fn a_bucket_that_is_gone_is_no_bucket_without_blobs() {
+    let (server, dir) = (S3Server::start(), tempfile::tempdir().unwrap());
+    let place = at(&server);
+    place.hold_for("one", Path::new("data")).await.unwrap();
+    let blobs = TenantBlobs::open(place, dir.path(), 0, Clock::start()).await.unwrap();
+    blobs.answers().await.unwrap();
+    std::fs::remove_dir_all(server.folder("")).unwrap();
+    assert!(matches!(blobs.answers().await, Err(ObjectError::Unavailable(_))));
 }

@@ -4,8 +4,6 @@
 //! `damaged/` and counts as missing. Clients are asked to upload it again, and tasks make results again. The
 //! bytes stay there as long as garbage, for an analysis of the fault.
 
-use std::sync::atomic::Ordering;
-
 use super::{BlobStore, ObjectError, Place};
 
 impl BlobStore {
@@ -19,7 +17,7 @@ impl BlobStore {
             Place::Disk(disk) => disk.set_aside_if_damaged(digest).await?,
             Place::Bucket(bucket) => bucket.set_aside_if_damaged(digest).await?,
         };
-        self.whole_bytes.fetch_sub(set_aside.unwrap_or(0), Ordering::Relaxed);
+        self.count_removed(set_aside.unwrap_or(0));
         Ok(set_aside.is_some())
     }
 }

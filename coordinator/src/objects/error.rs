@@ -45,6 +45,9 @@ pub enum ObjectError {
         "blob {0} has another digest on the coordinator's disk: the disk changed it; check the disk, and upload the blob again"
     )]
     Damaged(String),
+    /// The work on an upload has ended early, after an error or at the end of the process.
+    #[error("the upload was interrupted; call QueryBlob and continue it")]
+    Interrupted,
     /// Another stream writes this blob.
     #[error("blob {0} is being written by another stream; call QueryBlob and try again")]
     Busy(String),

@@ -9,7 +9,6 @@ use std::collections::HashSet;
 use std::fs::File;
 use std::io;
 use std::path::{Path, PathBuf};
-use std::sync::atomic::Ordering;
 use std::sync::{PoisonError, RwLock};
 use std::time::{Duration, SystemTime};
 
@@ -77,7 +76,7 @@ pub(super) fn remove_unused(
             if let Some(bytes) = remove_if_old(disk, &path, before)? {
                 removed.blobs += 1;
                 removed.bytes += bytes;
-                store.whole_bytes.fetch_sub(bytes, Ordering::Relaxed);
+                store.count_removed(bytes);
             }
         }
     }

@@ -385,16 +385,19 @@ impl BlobStore {
             }
             Place::Bucket(bucket) => {
                 let gone = |gone: bucket::Gone<'_>| match gone {
-                    bucket::Gone::Blob { bytes } => {
-                        self.whole_bytes.fetch_sub(bytes, Ordering::Relaxed);
-                    }
-                    bucket::Gone::Upload { digest, bytes } => {
-                        self.declare(digest, self.declared_bytes(digest).saturating_sub(bytes));
-                    }
+                    bucket::Gone::Blob { bytes } => self.count_removed(bytes),
+                    bucket::Gone::Damaged { .. } => {}
+                    bucket::Gone::Upload { digest, .. } => self.declare(digest, 0),
                 };
                 bucket.remove_unused(before, &used, |digest| self.is_written(digest), gone).await
             }
         }
+    }
+
+    /// A complete blob of `bytes` is gone. Two that notice it at once must not make the sum negative.
+    fn count_removed(&self, bytes: u64) {
+        let less = |whole: u64| Some(whole.saturating_sub(bytes));
+        let _ = self.whole_bytes.fetch_update(Ordering::Relaxed, Ordering::Relaxed, less);
     }
 
     /// Whether a stream writes the blob.

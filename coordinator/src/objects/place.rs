@@ -7,6 +7,7 @@ use std::time::Duration;
 use object_store::aws::AmazonS3Builder;
 use object_store::azure::MicrosoftAzureBuilder;
 use object_store::gcp::GoogleCloudStorageBuilder;
+use object_store::local::LocalFileSystem;
 use object_store::path::Path as ObjectPath;
 use object_store::prefix::PrefixStore;
 use object_store::{
@@ -14,7 +15,7 @@ use object_store::{
 };
 use url::Url;
 
-use super::ObjectError;
+use super::{ObjectError, io_error};
 
 /// Names the deployment whose files are in a bucket.
 const MARKER: &str = "fathom-deployment";
@@ -24,7 +25,7 @@ const RETRY_FOR: Duration = Duration::from_secs(10);
 /// Where the blobs of all tenants are.
 #[derive(Clone, Debug)]
 pub enum ObjectsAt {
-    /// In a folder, usually the data directory.
+    /// In a folder, usually the data directory, which a lock and its store protect.
     Folder(PathBuf),
     /// In a bucket.
     Bucket {
@@ -82,39 +83,80 @@ impl ObjectsAt {
         Ok(Self::Bucket { url: text.to_owned(), store: Arc::new(PrefixStore::new(store, prefix)) })
     }
 
-    /// Takes a bucket for a deployment, which is written there once. Without its jobs, garbage collection
-    /// would delete their files.
+    /// Takes a bucket, or a folder beside `data_dir`, for a deployment, whose name is written there once.
+    /// Without its jobs, garbage collection would delete their files.
     ///
     /// # Errors
-    /// When the bucket has the files of another deployment, or is not available.
-    pub async fn hold_for(&self, deployment: &str) -> Result<(), ObjectError> {
-        let Self::Bucket { url, store } = self else { return Ok(()) };
-        let marker = ObjectPath::from(MARKER);
-        let mut options = PutOptions::from(PutMode::Create);
-        for _ in 0..2 {
-            match store.get(&marker).await {
-                Ok(found) => {
-                    let found = found.bytes().await.map_err(ObjectError::Unavailable)?;
-                    let found = String::from_utf8_lossy(&found).trim().to_owned();
-                    if found == deployment {
-                        return Ok(());
+    /// When it has the files of another deployment, or is not available.
+    pub async fn hold_for(&self, deployment: &str, data_dir: &Path) -> Result<(), ObjectError> {
+        match self {
+            Self::Folder(folder) if is_same_folder(folder, data_dir) => Ok(()),
+            Self::Folder(folder) => {
+                let name = folder.display().to_string();
+                // The data directory of another coordinator names no deployment.
+                for other in ["store", "database.lock"].map(|name| folder.join(name)) {
+                    if other.exists() {
+                        return Err(refuse_other(&name, &other.display().to_string(), deployment));
                     }
-                    let (place, ours, marker) = (url.clone(), deployment.to_owned(), MARKER.to_owned());
-                    return Err(ObjectError::OfOther { place, found, ours, marker });
                 }
-                Err(object_store::Error::NotFound { .. }) => {}
-                Err(error) => return Err(ObjectError::Unavailable(error)),
+                std::fs::create_dir_all(folder).map_err(io_error("create", folder))?;
+                let store = LocalFileSystem::new_with_prefix(folder)?.with_fsync(true);
+                hold(&store, &name, deployment).await
             }
-            let text = format!("{deployment}\n");
-            match store.put_opts(&marker, text.into(), options.clone()).await {
-                // Read again: another coordinator may have written at the same time.
-                Ok(_) | Err(object_store::Error::AlreadyExists { .. }) => {}
-                Err(object_store::Error::NotImplemented { .. }) => options = PutOptions::default(),
-                Err(error) => return Err(ObjectError::Unavailable(error)),
+            Self::Bucket { url, store } => hold(store.as_ref(), url, deployment).await,
+        }
+    }
+
+    /// Whether a bucket answers and has its marker. A missing bucket would look like one without blobs.
+    ///
+    /// # Errors
+    /// When it does not.
+    pub async fn answers(&self) -> Result<(), ObjectError> {
+        match self {
+            Self::Folder(_) => Ok(()),
+            Self::Bucket { store, .. } => {
+                store.head(&ObjectPath::from(MARKER)).await.map(drop).map_err(ObjectError::Unavailable)
             }
         }
-        store.head(&marker).await.map(drop).map_err(ObjectError::Unavailable)
     }
+}
+
+fn is_same_folder(one: &Path, other: &Path) -> bool {
+    let whole = |path: &Path| path.canonicalize().unwrap_or_else(|_| path.to_owned());
+    whole(one) == whole(other)
+}
+
+fn refuse_other(place: &str, found: &str, ours: &str) -> ObjectError {
+    let (place, found, ours) = (place.to_owned(), found.to_owned(), ours.to_owned());
+    ObjectError::OfOther { place, found, ours, marker: MARKER.to_owned() }
+}
+
+async fn hold(store: &dyn ObjectStore, place: &str, deployment: &str) -> Result<(), ObjectError> {
+    let marker = ObjectPath::from(MARKER);
+    let mut options = PutOptions::from(PutMode::Create);
+    for _ in 0..2 {
+        match store.get(&marker).await {
+            Ok(found) => {
+                let found = found.bytes().await.map_err(ObjectError::Unavailable)?;
+                let found = String::from_utf8_lossy(&found).trim().to_owned();
+                return if found == deployment {
+                    Ok(())
+                } else {
+                    Err(refuse_other(place, &found, deployment))
+                };
+            }
+            Err(object_store::Error::NotFound { .. }) => {}
+            Err(error) => return Err(ObjectError::Unavailable(error)),
+        }
+        let text = format!("{deployment}\n");
+        match store.put_opts(&marker, text.into(), options.clone()).await {
+            // Read again: another coordinator may have written at the same time.
+            Ok(_) | Err(object_store::Error::AlreadyExists { .. }) => {}
+            Err(object_store::Error::NotImplemented { .. }) => options = PutOptions::default(),
+            Err(error) => return Err(ObjectError::Unavailable(error)),
+        }
+    }
+    store.head(&marker).await.map(drop).map_err(ObjectError::Unavailable)
 }
 
 /// Names the library that encrypts for HTTP clients of this process.
@@ -158,6 +200,22 @@ mod tests {
         );
         for url in ["s3://reef/scenes", "gs://reef"] {
             assert!(matches!(parsed(url), Ok(ObjectsAt::Bucket { .. })), "{url}: {:?}", parsed(url));
+        }
+    }
+
+    #[tokio::test]
+    async fn a_folder_beside_the_data_directory_serves_one_deployment() {
+        let dir = tempfile::tempdir().unwrap();
+        let (data, other) = (dir.path().join("data"), dir.path().join("objects"));
+        std::fs::create_dir_all(data.join("store")).unwrap();
+        let place = |folder: &Path| ObjectsAt::Folder(folder.to_owned());
+        place(&data).hold_for("one", &data).await.unwrap();
+        assert!(!data.join(MARKER).exists(), "its lock protects a data directory");
+        place(&other).hold_for("one", &data).await.unwrap();
+        place(&other).hold_for("one", &data).await.unwrap();
+        for folder in [&other, &data] {
+            let refused = place(folder).hold_for("two", &dir.path().join("third")).await.unwrap_err();
+            assert!(matches!(refused, ObjectError::OfOther { .. }), "{refused}");
         }
     }
 

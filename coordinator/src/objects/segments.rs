@@ -12,6 +12,7 @@ use bytes::Bytes;
 use futures::TryStreamExt;
 use object_store::ObjectStoreExt;
 use object_store::path::Path as ObjectPath;
+use tokio::sync::{mpsc, oneshot};
 use uuid::Uuid;
 
 use super::bucket::{Bucket, PART_BYTES, Parts, Pieces};
@@ -54,24 +55,20 @@ pub(super) async fn arrived_bytes(bucket: &Bucket, digest: &str) -> Result<u64, 
     Ok(arrived(bucket, digest).await?.iter().map(|segment| segment.bytes).sum())
 }
 
-/// An upload into segments.
-pub(super) struct Segments {
-    bucket: Arc<Bucket>,
-    /// No other stream writes this blob, also while the last bytes are saved after the end of this one.
-    claim: Arc<WriteClaim>,
-    /// Length of the whole blob.
-    bytes: u64,
-    complete: Vec<Segment>,
-    /// The segment that grows.
-    current: Option<Growing>,
-    /// Bytes that are in no part yet.
-    waiting: Pieces,
-}
+/// An upload into segments. A task of its own does the work, and no caller interrupts it. When a client
+/// disconnects, its call and this handle are dropped, and the task makes its last bytes a segment.
+pub(super) struct Segments(mpsc::Sender<(Request, oneshot::Sender<Result<(), ObjectError>>)>);
 
-struct Growing {
-    path: ObjectPath,
-    parts: Parts,
-    bytes: u64,
+/// What the task is asked for.
+enum Request {
+    /// Append these bytes.
+    Append(Bytes),
+    /// Make all bytes durable.
+    Save,
+    /// Make the bytes the blob. The caller has hashed them.
+    Publish,
+    /// Delete everything that has arrived.
+    Discard,
 }
 
 impl Segments {
@@ -92,133 +89,168 @@ impl Segments {
             }
         }
         let (bucket, claim) = (Arc::clone(bucket), Arc::clone(claim));
-        let opened = Self { bucket, claim, bytes, complete, current: None, waiting: Pieces::default() };
-        Ok((opened, hasher))
+        let upload = Upload { bucket, claim, bytes, complete, current: None, waiting: Pieces::default() };
+        // One message waits while another is written.
+        let (requests, queue) = mpsc::channel(1);
+        tokio::spawn(upload.run(queue));
+        Ok((Self(requests), hasher))
+    }
+
+    /// Appends bytes; they are durable after [`Segments::save`].
+    pub async fn append(&self, piece: Bytes) -> Result<(), ObjectError> {
+        self.ask(Request::Append(piece)).await
+    }
+
+    /// Makes all bytes durable: they become a segment. Nothing may follow.
+    pub async fn save(&self) -> Result<(), ObjectError> {
+        self.ask(Request::Save).await
+    }
+
+    /// Makes the bytes the blob; nothing may follow. The caller has hashed them.
+    pub async fn publish(&self) -> Result<(), ObjectError> {
+        self.ask(Request::Publish).await
+    }
+
+    /// Deletes everything that has arrived; nothing may follow.
+    pub async fn discard(&self) -> Result<(), ObjectError> {
+        self.ask(Request::Discard).await
+    }
+
+    async fn ask(&self, request: Request) -> Result<(), ObjectError> {
+        let (answer, answered) = oneshot::channel();
+        let ended = || ObjectError::Interrupted;
+        self.0.send((request, answer)).await.map_err(|_| ended())?;
+        answered.await.map_err(|_| ended())?
+    }
+}
+
+/// The work of an upload.
+struct Upload {
+    bucket: Arc<Bucket>,
+    /// No other stream writes this blob, until the last bytes are saved.
+    claim: Arc<WriteClaim>,
+    /// Length of the whole blob.
+    bytes: u64,
+    complete: Vec<Segment>,
+    /// The segment that grows.
+    current: Option<Growing>,
+    /// Bytes that are in no part yet.
+    waiting: Pieces,
+}
+
+struct Growing {
+    path: ObjectPath,
+    parts: Parts,
+    bytes: u64,
+}
+
+impl Upload {
+    /// Serves an upload to its end, or to its first error: what comes after an error does not belong behind
+    /// the durable bytes. The claim is given back before the last answer, so that the caller may begin again.
+    async fn run(mut self, mut queue: mpsc::Receiver<(Request, oneshot::Sender<Result<(), ObjectError>>)>) {
+        while let Some((request, answer)) = queue.recv().await {
+            let is_last = !matches!(request, Request::Append(_));
+            let done = match request {
+                Request::Append(piece) => self.append(piece).await,
+                Request::Save => self.save().await,
+                Request::Publish => self.publish().await,
+                Request::Discard => self.discard().await,
+            };
+            if is_last || done.is_err() {
+                drop(self);
+                // The caller may be gone.
+                let _ = answer.send(done);
+                return;
+            }
+            let _ = answer.send(done);
+        }
+        if let Err(error) = self.save().await {
+            tracing::warn!(%error, digest = self.claim.digest, "the end of an interrupted upload is lost");
+        }
     }
 
     fn durable_bytes(&self) -> u64 {
         self.complete.iter().map(|segment| segment.bytes).sum()
     }
 
-    fn is_unsaved(&self) -> bool {
-        self.current.is_some() || self.waiting.bytes > 0
-    }
-
-    /// Appends bytes; they are durable after [`Segments::save`].
-    pub async fn append(&mut self, piece: Bytes) -> Result<(), ObjectError> {
+    async fn append(&mut self, piece: Bytes) -> Result<(), ObjectError> {
         self.waiting.push(piece);
         while self.bytes > PART_BYTES as u64
             && let Some(part) = self.waiting.take_part(PART_BYTES)
         {
-            self.put(part, PART_BYTES as u64).await?;
-            if self.current.as_ref().is_some_and(|current| current.bytes >= SEGMENT_BYTES) {
-                self.save().await?;
+            let mut current = match self.current.take() {
+                Some(current) => current,
+                None => {
+                    let path = self.segment_path();
+                    let parts = Parts::begin(self.bucket.store(), &path).await?;
+                    Growing { path, parts, bytes: 0 }
+                }
+            };
+            current.parts.put(part).await?;
+            current.bytes += PART_BYTES as u64;
+            let is_full = current.bytes >= SEGMENT_BYTES;
+            self.current = Some(current);
+            if is_full {
+                self.complete_segment(Pieces::default()).await?;
             }
         }
         Ok(())
     }
 
-    async fn put(&mut self, part: Vec<Bytes>, bytes: u64) -> Result<(), ObjectError> {
-        let put = self.put_into_current(part, bytes).await;
-        if put.is_err() {
-            // A gap: what comes later does not belong behind what is durable.
-            self.current = None;
-            self.waiting.take();
-        }
-        put
-    }
-
-    async fn put_into_current(&mut self, part: Vec<Bytes>, bytes: u64) -> Result<(), ObjectError> {
-        let mut current = match self.current.take() {
-            Some(current) => current,
-            None => {
-                let path = self.segment_path(self.durable_bytes());
-                let parts = Parts::begin(self.bucket.store(), &path).await?;
-                Growing { path, parts, bytes: 0 }
-            }
-        };
-        current.parts.put(part).await?;
-        current.bytes += bytes;
-        self.current = Some(current);
-        Ok(())
-    }
-
-    fn segment_path(&self, offset: u64) -> ObjectPath {
+    fn segment_path(&self) -> ObjectPath {
         // Two streams at one offset, of two coordinators, write two objects.
         let random = Uuid::new_v4().simple().to_string();
-        let name = format!("{offset}-{}", &random[..12]);
+        let name = format!("{}-{}", self.durable_bytes(), &random[..12]);
         ObjectPath::from_iter(["uploads", &self.claim.digest, &name])
     }
 
-    /// Makes all bytes durable: they become a segment.
-    pub async fn save(&mut self) -> Result<(), ObjectError> {
-        let (waiting_bytes, waiting) = (self.waiting.bytes as u64, self.waiting.take());
+    async fn save(&mut self) -> Result<(), ObjectError> {
+        let waiting = std::mem::take(&mut self.waiting);
+        self.complete_segment(waiting).await
+    }
+
+    /// Ends the segment that grows, with some last bytes.
+    async fn complete_segment(&mut self, mut last: Pieces) -> Result<(), ObjectError> {
+        let bytes = last.bytes as u64;
         if let Some(mut current) = self.current.take() {
-            if waiting_bytes > 0 {
-                current.parts.put(waiting).await?;
+            if bytes > 0 {
+                current.parts.put(last.take()).await?;
             }
             current.parts.complete().await?;
-            self.complete.push(Segment { path: current.path, bytes: current.bytes + waiting_bytes });
-        } else if waiting_bytes > 0 {
-            let path = self.segment_path(self.durable_bytes());
-            let payload = waiting.into_iter().collect();
+            self.complete.push(Segment { path: current.path, bytes: current.bytes + bytes });
+        } else if bytes > 0 {
+            let path = self.segment_path();
+            let payload = last.take().into_iter().collect();
             self.bucket.store().put(&path, payload).await.map_err(ObjectError::Unavailable)?;
-            self.complete.push(Segment { path, bytes: waiting_bytes });
+            self.complete.push(Segment { path, bytes });
         }
         self.claim.count(self.durable_bytes());
         Ok(())
     }
 
-    /// Makes the bytes the blob. The caller has hashed them.
-    pub async fn publish(&mut self) -> Result<(), ObjectError> {
+    async fn publish(&mut self) -> Result<(), ObjectError> {
         if self.complete.is_empty() && self.current.is_none() {
             let whole: Vec<u8> = self.waiting.take().concat();
             return self.bucket.put(&self.claim.digest, whole.into()).await;
         }
         self.save().await?;
-        let paths: Vec<ObjectPath> = self.complete.iter().map(|segment| segment.path.clone()).collect();
+        let paths: Vec<ObjectPath> = self.complete.drain(..).map(|segment| segment.path).collect();
         self.bucket.publish(&self.claim.digest, self.bytes, &paths).await?;
         // Garbage collection finds what stays here.
-        if let Err(error) = self.bucket.delete(paths).await {
+        if let Err(error) = self.bucket.delete(paths, |_| ()).await {
             let digest = &self.claim.digest;
             tracing::warn!(%error, digest, "segments of a complete upload remain in the bucket");
         }
         Ok(())
     }
 
-    /// Deletes everything that has arrived.
-    pub async fn discard(&mut self) -> Result<(), ObjectError> {
+    async fn discard(&mut self) -> Result<(), ObjectError> {
         self.waiting.take();
         if let Some(mut current) = self.current.take() {
             current.parts.abort().await;
         }
-        let paths = arrived(&self.bucket, &self.claim.digest).await?;
         self.complete.clear();
-        self.bucket.delete(paths.into_iter().map(|segment| segment.path).collect()).await
-    }
-}
-
-impl Drop for Segments {
-    /// A client that disconnects ends the call, and with it the writer. Its last bytes become a segment, and
-    /// the next stream waits for that.
-    fn drop(&mut self) {
-        let Ok(runtime) = tokio::runtime::Handle::try_current() else { return };
-        if !self.is_unsaved() {
-            return;
-        }
-        let mut rest = Self {
-            bucket: Arc::clone(&self.bucket),
-            claim: Arc::clone(&self.claim),
-            bytes: self.bytes,
-            complete: std::mem::take(&mut self.complete),
-            current: self.current.take(),
-            waiting: std::mem::take(&mut self.waiting),
-        };
-        runtime.spawn(async move {
-            if let Err(error) = rest.save().await {
-                let digest = &rest.claim.digest;
-                tracing::warn!(%error, digest, "the end of an interrupted upload is lost");
-            }
-        });
+        let paths = arrived(&self.bucket, &self.claim.digest).await?;
+        self.bucket.delete(paths.into_iter().map(|segment| segment.path).collect(), |_| ()).await
     }
 }

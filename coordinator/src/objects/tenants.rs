@@ -2,12 +2,12 @@
 
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 
 use object_store::ObjectStore;
 use object_store::path::Path as ObjectPath;
 use object_store::prefix::PrefixStore;
-use tokio::sync::Mutex;
+use tokio::sync::OnceCell;
 
 use super::{BlobStore, ObjectError, ObjectsAt, check_disk, free_bytes, io_error};
 use crate::clock::Clock;
@@ -20,7 +20,7 @@ pub struct TenantBlobs {
     data_dir: PathBuf,
     min_free_bytes: u64,
     clock: Clock,
-    open: Mutex<HashMap<Tenant, Arc<BlobStore>>>,
+    open: Mutex<HashMap<Tenant, Arc<OnceCell<Arc<BlobStore>>>>>,
 }
 
 impl TenantBlobs {
@@ -65,10 +65,15 @@ impl TenantBlobs {
     /// # Errors
     /// When its folder cannot be created, or the bucket is not available.
     pub async fn of(&self, tenant: &Tenant) -> Result<Arc<BlobStore>, ObjectError> {
-        let mut open = self.open.lock().await;
-        if let Some(store) = open.get(tenant) {
-            return Ok(Arc::clone(store));
-        }
+        // While the bucket is listed for one tenant, the calls of others go on.
+        let cell = {
+            let mut open = self.open.lock().unwrap_or_else(PoisonError::into_inner);
+            Arc::clone(open.entry(tenant.clone()).or_default())
+        };
+        Ok(Arc::clone(cell.get_or_try_init(|| self.opened(tenant)).await?))
+    }
+
+    async fn opened(&self, tenant: &Tenant) -> Result<Arc<BlobStore>, ObjectError> {
         let store = match &self.at {
             ObjectsAt::Folder(root) => {
                 BlobStore::open(&Self::folder(root, tenant), self.min_free_bytes, self.clock)?
@@ -78,9 +83,7 @@ impl TenantBlobs {
                 BlobStore::open_bucket(of_tenant(store, tenant), staging, self.clock).await?
             }
         };
-        let store = Arc::new(store);
-        open.insert(tenant.clone(), Arc::clone(&store));
-        Ok(store)
+        Ok(Arc::new(store))
     }
 
     /// Bytes of all blobs of a tenant; nothing is created if it has none.
@@ -92,6 +95,14 @@ impl TenantBlobs {
             ObjectsAt::Folder(root) if !Self::folder(root, tenant).is_dir() => Ok(0),
             _ => Ok(self.of(tenant).await?.used_bytes()),
         }
+    }
+
+    /// Whether the bucket is there; see [`ObjectsAt::answers`].
+    ///
+    /// # Errors
+    /// When it is not.
+    pub async fn answers(&self) -> Result<(), ObjectError> {
+        self.at.answers().await
     }
 
     /// Bytes free on the disk of the data directory, and bytes that must stay free.

@@ -6,7 +6,7 @@
 //! bytes again.
 
 use std::collections::BTreeMap;
-use std::io::BufReader;
+use std::io::{BufRead as _, BufReader};
 use std::sync::Arc;
 
 use fathom_core::exchange::Exchange;
@@ -79,8 +79,11 @@ async fn water_of(
     }
     let (files, path) = (objects.files(), objects.path_of(made(&view.job, Artifact::CoarseModel)?)?);
     let coarse = blocking(move || {
-        let (file, _) = files.open(&path).map_err(|error| OwnTaskError::of_io(&error))?;
-        let header = SplatReader::new(BufReader::new(file), "the coarse model");
+        let file = files.open(&path).map(|(file, _)| BufReader::new(file));
+        // Its first bytes tell an outage from a damaged header.
+        let file = file.and_then(|mut file| file.fill_buf().map(drop).map(|()| file));
+        let file = file.map_err(|error| OwnTaskError::of_io(&error))?;
+        let header = SplatReader::new(file, "the coarse model");
         let water = header.and_then(|header| WaterRecord::among(header.comments()));
         water.map_err(|e| OwnTaskError::failed(e.to_string()))
     });

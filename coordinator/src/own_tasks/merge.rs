@@ -73,6 +73,7 @@ pub async fn merge_job(
     .await;
     let (merged, manifest, water) = match made {
         Ok(made) => made,
+        Err(error) if error.is_outage => return Err(error),
         Err(error) => return Err(lost_results(objects, &handed_in, error).await?),
     };
     let duplicates: u64 = merged.partitions.iter().map(|partition| partition.duplicates).sum();

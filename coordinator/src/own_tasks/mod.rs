@@ -144,8 +144,14 @@ async fn run_task(shared: &State, grant: Grant, stopping: &mut watch::Receiver<b
 async fn execute_through_outages(shared: &State, grant: &Grant) -> Result<TaskOutput, OwnTaskError> {
     let mut pause = LOOK_EVERY;
     loop {
-        match execute(shared, grant).await {
-            Err(error) if error.is_outage => {
+        let result = execute(shared, grant).await;
+        let is_outage = match &result {
+            Ok(_) => false,
+            // In a bucket that is gone, nothing is found.
+            Err(error) => error.is_outage || shared.objects.answers().await.is_err(),
+        };
+        match result {
+            Err(error) if is_outage => {
                 tracing::warn!(%error, seconds = pause.as_secs_f64(), "the task begins again after a pause");
                 tokio::time::sleep(pause).await;
                 pause = (pause * 2).min(LONGEST_PAUSE);

@@ -98,7 +98,7 @@ impl Jobs {
         let objects = self.0.objects.of(&tenant).await?;
         let (dataset, list) = dataset.map(|(dataset, list)| (dataset.id, list)).unzip();
         manifests::check(&objects, &manifest, list).await?;
-        objects.check_space(0).await?;
+        self.0.objects.check_space(0).await?;
         self.0.check_bytes(&tenant, 0).await?;
         let new = NewJob {
             job_id: JobId::new(self.0.clock.now_ms(), random_bits()),

@@ -18,7 +18,7 @@ use crate::metrics::Metrics;
 use crate::objects::{BlobStore, BlobWriter, ObjectError};
 use crate::schedule::Tenant;
 use crate::service_error::ServiceError;
-use crate::state::State;
+use crate::state::{State, stopped};
 
 /// Maximum blobs in one call.
 pub(super) const MAX_BLOBS: usize = 10_000;
@@ -90,6 +90,7 @@ impl Uploads {
         let Some(mut writer) = begun? else {
             return Ok(v1::WriteBlobResponse { committed_size_bytes: blob.bytes, complete: true });
         };
+        let mut stopping = self.0.stopping.clone();
         let mut piece = first;
         loop {
             let finish = piece.finish;
@@ -100,7 +101,16 @@ impl Uploads {
                 writer.finish().await?;
                 return Ok(v1::WriteBlobResponse { committed_size_bytes: blob.bytes, complete: true });
             }
-            match pieces.message().await {
+            let next = tokio::select! {
+                biased;
+                // What has arrived is kept, and the client continues at the next process.
+                () = stopped(&mut stopping) => {
+                    writer.pause().await?;
+                    return Err(ObjectError::Interrupted.into());
+                }
+                next = pieces.message() => next,
+            };
+            match next {
                 Ok(Some(next)) => piece = next,
                 // The client ended or disconnected without `finish`: the received bytes are kept for the next
                 // stream.

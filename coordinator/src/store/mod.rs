@@ -288,7 +288,7 @@ pub struct StoredEvent {
 }
 
 /// A name for a new deployment.
-pub(crate) fn new_deployment() -> String {
+fn new_deployment() -> String {
     uuid::Uuid::new_v4().to_string()
 }
 

@@ -29,9 +29,6 @@ app.kubernetes.io/instance: {{ .Release.Name }}
 {{- if and (not $c.insecure) (or (not $c.tlsSecret) (not $c.tokens)) }}
 {{- fail "anyone in the cluster could read and control everything: set coordinator.tlsSecret and coordinator.tokens, or coordinator.insecure" }}
 {{- end }}
-{{- if and $c.tokens .Values.workers.pools (not .Values.workers.tokenSecret) }}
-{{- fail "workers need a token: run `fathom token issue --role worker`, put it into a Secret, and set workers.tokenSecret" }}
-{{- end }}
 {{- if and .Values.keda.enabled (not $c.insecure) (or (not .Values.keda.clientSecret) (not .Values.keda.clientCaSecret)) }}
 {{- fail "KEDA must show a certificate: set keda.clientSecret and keda.clientCaSecret, or coordinator.insecure" }}
 {{- end }}
