@@ -9,7 +9,7 @@ use std::collections::{BTreeMap, HashMap, HashSet, VecDeque};
 use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
-use std::time::SystemTime;
+use std::time::{Duration, SystemTime};
 
 use bytes::Bytes;
 use futures::{StreamExt, TryStreamExt};
@@ -25,6 +25,8 @@ use crate::clock::Clock;
 pub(super) const PART_BYTES: usize = 8 << 20;
 /// Most parts of one upload; S3 allows 10,000.
 const MOST_PARTS: u64 = 9000;
+/// Whoever checks an object younger than this is not remembered: it stays for most of a day anyway.
+const YOUNG: Duration = Duration::from_secs(3600);
 /// Objects that are removed while checks wait.
 const REMOVED_AT_ONCE: usize = 100;
 /// Deletions at a time.
@@ -44,7 +46,7 @@ pub(super) struct Bucket {
     clock: Clock,
     /// Local folder for files that become blobs.
     pub staging: PathBuf,
-    /// When blobs were last checked.
+    /// When blobs were last checked; neither missing nor young ones, whose number no caller may decide.
     asked: Mutex<HashMap<String, SystemTime>>,
     /// Read-locked while a blob is checked, write-locked while blobs are removed. Whoever publishes a blob
     /// has found it missing before, and gives it a new time, so garbage collection does not take it for old.
@@ -111,11 +113,13 @@ impl Bucket {
     pub async fn ask(&self, digest: &str) -> Result<Option<u64>, ObjectError> {
         let path = object_path(digest)?;
         let _nothing_is_removed = self.checking.read().await;
-        if !self.only_looks {
-            let now = self.clock.system_time();
+        let Some(found) = self.head(&path).await? else { return Ok(None) };
+        let now = self.clock.system_time();
+        let is_young = now.duration_since(found.last_modified.into()).is_ok_and(|age| age < YOUNG);
+        if !self.only_looks && !is_young {
             self.asked.lock().unwrap_or_else(PoisonError::into_inner).insert(digest.to_owned(), now);
         }
-        Ok(self.head(&path).await?.map(|meta| meta.size))
+        Ok(Some(found.size))
     }
 
     /// What is known of an object; `None` if there is none.
@@ -353,6 +357,12 @@ impl Bucket {
     fn is_asked_since(&self, digest: &str, before: SystemTime) -> bool {
         let asked = self.asked.lock().unwrap_or_else(PoisonError::into_inner);
         asked.get(digest).is_some_and(|when| *when >= before)
+    }
+
+    /// Number of blobs whose last check is in memory.
+    #[cfg(test)]
+    pub fn remembered(&self) -> usize {
+        self.asked.lock().unwrap_or_else(PoisonError::into_inner).len()
     }
 
     /// Deletes objects, and calls `gone` for each that was deleted. Those that do not exist count as deleted.

@@ -218,7 +218,14 @@ async fn old_objects_are_removed_unless_used_or_checked() {
     }
     age(&segment(), 2 * DAY);
     let kept = HashSet::from([used.digest.clone()]);
+    let remembered = || match &store.place {
+        Place::Bucket(bucket) => bucket.remembered(),
+        Place::Disk(_) => panic!("it is in a bucket"),
+    };
+    assert!(store.contains(&young).await.unwrap() && !store.contains(&BlobRef::of(b"no")).await.unwrap());
+    assert_eq!(remembered(), 0, "callers fill the memory with missing or young blobs");
     assert!(store.contains(&asked).await.unwrap());
+    assert_eq!(remembered(), 1);
     let running = send(&store, &half, 10, 20).await;
     let before = SystemTime::now() - DAY;
     let removed = store.remove_unused(before, kept.clone()).await.unwrap();

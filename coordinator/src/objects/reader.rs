@@ -55,10 +55,10 @@ impl BlobStore {
         }
     }
 
-    /// The digest of the bytes that are there; `None` if there are none.
+    /// The digest of a blob's bytes as they are now.
     ///
     /// # Errors
-    /// When they cannot be read.
+    /// When there is no such blob, or it cannot be read.
     pub async fn digest_of(self: &Arc<Self>, blob: &BlobRef) -> Result<String, ObjectError> {
         let (files, path) = (self.files(), self.path_of(blob)?);
         let to_open = path.clone();
