@@ -124,7 +124,7 @@ impl Default for CoordinatorConfig {
             tenant_open_jobs: 0,
             tenant_parallel: 0,
             tenant_bytes: 0,
-            attempt_log_bytes: 4 << 20,
+            attempt_log_bytes: crate::logs::ATTEMPT_BYTES,
             min_free_bytes: 1 << 30,
         }
     }

@@ -3,6 +3,7 @@
 use std::net::SocketAddr;
 use std::path::PathBuf;
 
+use crate::logs::LogError;
 use crate::objects::ObjectError;
 use crate::store::StoreError;
 use crate::store::export::ExportError;
@@ -42,6 +43,9 @@ pub enum CoordinatorError {
     /// The object store cannot be opened.
     #[error(transparent)]
     Objects(#[from] ObjectError),
+    /// Logs cannot be read or written.
+    #[error(transparent)]
+    Logs(#[from] LogError),
     /// The server failed.
     #[error("gRPC server: {0}")]
     Server(String),

@@ -8,6 +8,7 @@
 pub mod access;
 mod capacity;
 mod clock;
+mod company;
 mod config;
 mod connections;
 mod data_dir;

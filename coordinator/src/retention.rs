@@ -8,10 +8,10 @@ use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
-use fathom_observe::threads;
 use tracing::Instrument;
 
 use crate::datasets::DatasetId;
+use crate::logs::LogError;
 use crate::objects::{ObjectError, Removed};
 use crate::references::{Reference, reference_of, references};
 use crate::schedule::{JobId, Tenant};
@@ -61,6 +61,9 @@ pub enum RetentionError {
     /// The blobs of a tenant cannot be listed.
     #[error(transparent)]
     Object(#[from] ObjectError),
+    /// Logs cannot be listed.
+    #[error(transparent)]
+    Logs(#[from] LogError),
     /// A file cannot be removed.
     #[error("blobs cannot be removed: {0}")]
     Io(#[from] std::io::Error),
@@ -133,9 +136,7 @@ async fn forget_jobs(shared: &State, keep: Option<Duration>) -> Result<u64, Stor
 
 /// Deletes the logs of deleted jobs: a coordinator may have crashed between the two deletions.
 async fn forget_logs(shared: &State) -> Result<(), RetentionError> {
-    let kept = Arc::clone(&shared.logs);
-    let jobs = threads::blocking(move || kept.jobs()).await.map_err(std::io::Error::other)??;
-    for job in jobs {
+    for job in shared.logs.jobs().await? {
         match shared.jobs.job_row(&job).await {
             Ok(_) => {}
             Err(StoreError::JobNotFound(_)) => logs::forget(shared, &job).await,

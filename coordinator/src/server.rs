@@ -3,6 +3,7 @@
 use std::collections::HashMap;
 use std::io;
 use std::net::SocketAddr;
+use std::sync::atomic::AtomicU32;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
@@ -24,11 +25,11 @@ use crate::access::guard::{Guard, GuardLayer};
 use crate::access::places::Places;
 use crate::access::{Access, RateLimit, ensure_operator};
 use crate::clock::Clock;
+use crate::company::keep_in_touch;
 use crate::config::CoordinatorConfig;
 use crate::connections::{Accepted, Connections, Room, accepted};
 use crate::data_dir;
 use crate::error::CoordinatorError;
-use crate::logs::JobLogs;
 use crate::metrics::Metrics;
 use crate::metrics::endpoint::Endpoint;
 use crate::metrics::rpc::RpcLayer;
@@ -40,7 +41,7 @@ use crate::retention::{Housekeeping, Policy, RetentionError, collect, collect_ga
 use crate::scaler;
 use crate::services::{Admin, Jobs, Uploads, Workers, logs, release_disowned};
 use crate::state::{State, stopped};
-use crate::store::{PostgresOptions, PostgresStore, SledOptions, SledStore, Store, StoreError};
+use crate::store::{Hold, PostgresOptions, PostgresStore, SledOptions, SledStore, Store};
 use crate::sweep::sweep_leases;
 use crate::tls::Tls;
 use crate::wakeups::Wakeups;
@@ -58,8 +59,6 @@ pub const MAX_UPLOAD_MESSAGE_BYTES: usize = 12 << 20;
 const MAX_CALLS_OF_A_CONNECTION: u32 = 1024;
 /// Time that open calls have to end when the coordinator stops.
 const STOP_WITHIN: Duration = Duration::from_secs(5);
-/// Pause between two readings of a database's tokens: a revoked one is refused within two seconds.
-const READ_TOKENS_EVERY: Duration = Duration::from_secs(1);
 
 /// A running coordinator.
 pub struct Coordinator {
@@ -161,9 +160,10 @@ pub async fn serve(config: CoordinatorConfig) -> Result<Coordinator, Coordinator
     let clock = Clock::start();
     data_dir::make(&config.data_dir)?;
     let at = ObjectsAt::parse(config.objects.as_deref(), &config.data_dir)?;
-    let store = open_store(&config).await?;
+    let store = open_store(&config, &at).await?;
     at.hold_for(&store.deployment().await?, &config.data_dir).await?;
-    let objects = TenantBlobs::open(at, &config.data_dir, config.min_free_bytes, clock).await?;
+    let objects =
+        TenantBlobs::open(at, &config.data_dir, config.min_free_bytes, clock, store.ledger()).await?;
     let house = config.housekeeping();
     let room = Room::of_this_process();
     let mut coordinator =
@@ -176,15 +176,23 @@ pub async fn serve(config: CoordinatorConfig) -> Result<Coordinator, Coordinator
     Ok(coordinator)
 }
 
-/// The store that the configuration names, for this process alone.
-async fn open_store(config: &CoordinatorConfig) -> Result<Arc<dyn Store>, CoordinatorError> {
+/// The store that the configuration names. A database serves several coordinators when their files are in a
+/// bucket too; otherwise it is held for this process alone.
+async fn open_store(
+    config: &CoordinatorConfig,
+    objects: &ObjectsAt,
+) -> Result<Arc<dyn Store>, CoordinatorError> {
     let (rules, lease_ms, stall_ms) = (config.rules(), config.lease_ms.into(), config.stall_ms.into());
     if let Some(url) = &config.store {
         let connections = config.store_connections;
         let options = PostgresOptions { url: url.clone(), rules, lease_ms, stall_ms, connections };
         let held = data_dir::hold_for_database(&config.data_dir, &options.place()?)?;
         let store = PostgresStore::open(&options).await?;
-        store.hold_alone(Some(held)).await?;
+        let hold = match objects {
+            ObjectsAt::Bucket { .. } => Hold::WithOthers,
+            ObjectsAt::Folder(_) => Hold::Alone,
+        };
+        store.hold(hold, Some(held)).await?;
         return Ok(Arc::new(store));
     }
     data_dir::refuse_if_of_database(&config.data_dir)?;
@@ -194,8 +202,8 @@ async fn open_store(config: &CoordinatorConfig) -> Result<Arc<dyn Store>, Coordi
 }
 
 /// Starts a coordinator on a given store, clock and connections, with given settings of garbage collection,
-/// for simulations. Blobs and logs lie in `data_dir`, metrics are not served, and `listen` is only the
-/// reported address.
+/// for simulations. Blobs lie in `data_dir`, logs too unless the store has them, metrics are not served, and
+/// `listen` is only the reported address.
 ///
 /// # Errors
 /// As [`serve`].
@@ -213,7 +221,7 @@ where
 {
     let tls = tls_of(&config)?;
     let at = ObjectsAt::Folder(config.data_dir.clone());
-    let objects = TenantBlobs::open(at, &config.data_dir, config.min_free_bytes, clock).await?;
+    let objects = TenantBlobs::open(at, &config.data_dir, config.min_free_bytes, clock, None).await?;
     let incoming = incoming.filter_map(|accepted| std::future::ready(accepted.ok().map(|io| (io, None))));
     let room = Room::of_descriptors(None);
     start(config, tls, objects, Arc::new(store), clock, house, None, room, incoming).await
@@ -259,9 +267,10 @@ where
     } else {
         Arc::new(Access::open())
     };
+    let members = Arc::new(AtomicU32::new(1));
     let guard = Guard {
         access: Arc::clone(&access),
-        rate: RateLimit::new(config.calls_per_second),
+        rate: RateLimit::new(config.calls_per_second, Arc::clone(&members)),
         workers_show_certificates: config.client_ca.is_some(),
         clock,
         places: Places::default(),
@@ -273,17 +282,18 @@ where
     let (stopping, stop_signal) = watch::channel(false);
     let metrics = Arc::new(Metrics::default());
     let shared = Arc::new(State {
+        logs: crate::logs::of(store.as_ref(), &config.data_dir, config.attempt_log_bytes),
         jobs: Arc::new(CountedStore { store: Arc::clone(&store), metrics: Arc::clone(&metrics) }),
         store,
         objects,
         access,
-        logs: Arc::new(JobLogs::new(&config.data_dir.join("logs"), config.attempt_log_bytes)),
         own_lines: Arc::default(),
         metrics,
         clock,
         lease_ms: config.lease_ms,
         wakeups: Wakeups::default(),
         stopping: stop_signal,
+        members,
         workers: WorkerRegistry::new(clock, config.lease_ms, marks),
         gaps: Mutex::new(HashMap::new()),
         revoking: Default::default(),
@@ -315,8 +325,8 @@ where
             () = calls.watch(access, clock) => {}
         }
     });
-    if config.store.is_some() {
-        tokio::spawn(read_tokens(Arc::clone(&shared)));
+    if let Some(members) = shared.store.members() {
+        tokio::spawn(keep_in_touch(Arc::clone(&shared), members));
     }
     let guard = GuardLayer(Arc::new(guard));
     let incoming = connections.of(incoming);
@@ -334,24 +344,6 @@ where
         }
     };
     Ok(Coordinator { address, metrics_address, scaler_address: None, scheme, stopping, running, shared })
-}
-
-/// Reads the tokens of a database again at intervals, until the coordinator stops: other processes write them
-/// too.
-async fn read_tokens(shared: Arc<State>) {
-    let mut stopping = shared.stopping.clone();
-    loop {
-        tokio::select! {
-            biased;
-            () = stopped(&mut stopping) => return,
-            () = tokio::time::sleep(READ_TOKENS_EVERY) => {}
-        }
-        match shared.access.read_again(shared.store.as_ref()).await {
-            // The sweeper reports an outage.
-            Ok(()) | Err(StoreError::Unavailable(_)) => {}
-            Err(error) => tracing::error!(%error, "cannot read the tokens; those that are known stay valid"),
-        }
-    }
 }
 
 async fn listen(listen: SocketAddr) -> Result<(TcpListener, SocketAddr), CoordinatorError> {

@@ -10,6 +10,7 @@ use tonic_types::{ErrorDetails, StatusExt};
 
 use crate::access::{IssueError, Refused, Role};
 use crate::datasets::FileFault;
+use crate::logs::LogError;
 use crate::objects::ObjectError;
 use crate::schedule::{ParseIdError, Refusal, Tenant};
 use crate::store::StoreError;
@@ -126,6 +127,15 @@ pub enum ServiceError {
 impl From<IssueError> for ServiceError {
     fn from(IssueError { field, message }: IssueError) -> Self {
         Self::BadArgument { field, message }
+    }
+}
+
+impl From<LogError> for ServiceError {
+    fn from(error: LogError) -> Self {
+        match error {
+            LogError::File(error) => error.into(),
+            LogError::Store(error) => error.into(),
+        }
     }
 }
 
@@ -269,12 +279,14 @@ impl From<ServiceError> for Status {
                 | StoreError::OtherSchema { .. }
                 | StoreError::Failed(_) => (Code::Unavailable, "STORE_FAILED"),
                 StoreError::Unavailable(error) => {
-                    // Clients must not learn addresses of this network. The sweeper reports it once.
-                    tracing::debug!(%error, "the database is not available");
-                    message = "the coordinator's database is not available; repeat the call".into();
+                    message = without_database(error);
                     (Code::Unavailable, "STORE_FAILED")
                 }
             },
+            ServiceError::Object(ObjectError::Ledger(StoreError::Unavailable(error))) => {
+                message = without_database(error);
+                (Code::Unavailable, "STORE_FAILED")
+            }
             ServiceError::Object(error) => match error {
                 ObjectError::BadDigest(_) => (Code::InvalidArgument, "BAD_ARGUMENT"),
                 ObjectError::TooLarge { .. } => (Code::InvalidArgument, "BLOB_TOO_LARGE"),
@@ -298,6 +310,8 @@ impl From<ServiceError> for Status {
                 }
                 ObjectError::Io { .. }
                 | ObjectError::Store(_)
+                | ObjectError::Ledger(_)
+                | ObjectError::Late { .. }
                 | ObjectError::BadUrl { .. }
                 | ObjectError::OfOther { .. } => {
                     // Clients must not learn paths of this machine.
@@ -333,4 +347,10 @@ impl From<ServiceError> for Status {
         }
         Status::with_error_details(code, message, details)
     }
+}
+/// The message while the database is not available. Clients must not learn addresses of this network, and
+/// the sweeper reports the outage once.
+fn without_database(error: &str) -> String {
+    tracing::debug!(%error, "the database is not available");
+    "the coordinator's database is not available; repeat the call".into()
 }

@@ -1,6 +1,7 @@
 //! State shared by the services, the coordinator's own tasks and the sweeper.
 
 use std::collections::HashMap;
+use std::sync::atomic::AtomicU32;
 use std::sync::{Arc, Mutex};
 
 use fathom_observe::queue::Queue;
@@ -9,7 +10,7 @@ use tokio::sync::watch;
 use crate::access::{Access, Principal};
 use crate::capacity::Gap;
 use crate::clock::Clock;
-use crate::logs::JobLogs;
+use crate::logs::Logs;
 use crate::metrics::Metrics;
 use crate::objects::TenantBlobs;
 use crate::retention::Policy;
@@ -30,7 +31,7 @@ pub struct State {
     /// Tokens.
     pub access: Arc<Access>,
     /// Log lines of jobs.
-    pub logs: Arc<JobLogs>,
+    pub logs: Arc<dyn Logs>,
     /// Log lines of the coordinator's own tasks on their way there.
     pub own_lines: Arc<Queue<Lease>>,
     /// Metrics.
@@ -45,6 +46,8 @@ pub struct State {
     pub stopping: watch::Receiver<bool>,
     /// Workers that have called recently.
     pub workers: WorkerRegistry,
+    /// Number of coordinators that share the store and take calls, this one included.
+    pub members: Arc<AtomicU32>,
     /// Jobs that no connected worker can continue.
     pub gaps: Mutex<HashMap<JobId, Gap>>,
     /// Held while a token is revoked.

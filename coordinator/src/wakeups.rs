@@ -1,6 +1,8 @@
-//! Wakes waiting calls on changes.
+//! Wakes waiting calls on changes, here and at the other coordinators.
 
 use tokio::sync::watch;
+
+use crate::store::members::Hint;
 
 /// Counters that move on changes. They are hints: waiting calls also check at intervals.
 pub struct Wakeups {
@@ -10,6 +12,17 @@ pub struct Wakeups {
     pub work: watch::Sender<u64>,
     /// Moves when work may have to stop for a reason other than its own worker.
     pub interrupts: watch::Sender<u64>,
+    /// Changes by this process, for the other coordinators.
+    pub made_here: watch::Sender<MadeHere>,
+}
+
+/// Counts of changes by this process.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct MadeHere {
+    /// Changes that may bring work.
+    pub work: u64,
+    /// Those of them after which work may have to stop.
+    pub interrupts: u64,
 }
 
 impl Default for Wakeups {
@@ -18,25 +31,42 @@ impl Default for Wakeups {
             changes: watch::Sender::new(0),
             work: watch::Sender::new(0),
             interrupts: watch::Sender::new(0),
+            made_here: watch::Sender::default(),
         }
     }
+}
+
+fn advance(counter: &watch::Sender<u64>) {
+    counter.send_modify(|version| *version = version.wrapping_add(1));
 }
 
 impl Wakeups {
     /// Wakes all waiting calls.
     pub fn changed(&self) {
-        self.progressed();
-        self.work.send_modify(|version| *version = version.wrapping_add(1));
+        self.heard(Hint::Work);
+        self.made_here.send_modify(|made| made.work = made.work.wrapping_add(1));
     }
 
     /// Wakes watchers, after a change that creates no work.
     pub fn progressed(&self) {
-        self.changes.send_modify(|version| *version = version.wrapping_add(1));
+        advance(&self.changes);
     }
 
     /// Wakes all waiting calls, and workers that may have to stop.
     pub fn interrupted(&self) {
-        self.changed();
-        self.interrupts.send_modify(|version| *version = version.wrapping_add(1));
+        self.heard(Hint::Interrupt);
+        self.made_here.send_modify(|made| {
+            made.work = made.work.wrapping_add(1);
+            made.interrupts = made.interrupts.wrapping_add(1);
+        });
+    }
+
+    /// Wakes calls after a change at another coordinator.
+    pub fn heard(&self, hint: Hint) {
+        advance(&self.changes);
+        advance(&self.work);
+        if hint == Hint::Interrupt {
+            advance(&self.interrupts);
+        }
     }
 }

@@ -1,21 +1,24 @@
-//! The workers that have called this process: identity, liveness, and marks (cordoned or draining).
+//! The workers that have called this coordinator, or another one with the same database: identity, liveness,
+//! and marks (cordoned or draining).
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use fathom_plan::Connected;
+use serde::{Deserialize, Serialize};
 
 use crate::access::{Access, Principal};
 use crate::clock::Clock;
 use crate::schedule::{Stage, Tenant, WorkerProfile};
 use crate::service_error::ServiceError;
 use crate::store::WorkerMark;
+use crate::store::members::SharedWorker;
 
 /// Cache time of [`WorkerRegistry::peers`], milliseconds.
 const PEERS_FOR_MS: u64 = 200;
 
-/// A worker that has registered with this process.
-#[derive(Clone, Debug)]
+/// A worker that has registered.
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct KnownWorker {
     /// Its profile for the assignment of tasks.
     pub profile: WorkerProfile,
@@ -24,20 +27,23 @@ pub struct KnownWorker {
     /// Version of its program.
     pub build_version: String,
     /// Its last call, Unix milliseconds.
+    #[serde(skip)]
     pub seen_ms: u64,
     /// The caller that registered it, its only owner.
     pub owner: Principal,
 }
 
-/// All workers that this process knows.
+/// All workers that this process knows of.
 pub struct WorkerRegistry {
     clock: Clock,
     /// Lease duration, milliseconds.
     lease_ms: u32,
     /// Workers that have called, by incarnation.
     workers: Mutex<HashMap<String, KnownWorker>>,
-    /// Marked workers, by incarnation; also stored.
-    marks: Mutex<HashMap<String, WorkerMark>>,
+    /// Those that have called this process since the latest report to other coordinators.
+    called: Mutex<HashSet<String>>,
+    /// Marked workers, by incarnation, also stored; and the number of changes by this process.
+    marks: Mutex<(HashMap<String, WorkerMark>, u64)>,
     /// The cached answer of [`WorkerRegistry::peers`], and its time, Unix milliseconds.
     connected: Mutex<(u64, Arc<[WorkerProfile]>)>,
 }
@@ -46,7 +52,8 @@ impl WorkerRegistry {
     /// An empty registry with the stored marks.
     pub fn new(clock: Clock, lease_ms: u32, marks: HashMap<String, WorkerMark>) -> Self {
         let connected = Mutex::new((0, Arc::default()));
-        Self { clock, lease_ms, workers: Mutex::default(), marks: Mutex::new(marks), connected }
+        let (workers, called) = (Mutex::default(), Mutex::default());
+        Self { clock, lease_ms, workers, called, marks: Mutex::new((marks, 0)), connected }
     }
 
     /// Adds a worker that registers; it counts at once.
@@ -88,7 +95,44 @@ impl WorkerRegistry {
         let worker =
             workers.get_mut(incarnation).filter(|worker| worker.owner.token_id == caller.token_id)?;
         worker.seen_ms = now_ms;
-        Some(worker.clone())
+        let worker = worker.clone();
+        drop(workers);
+        let mut called = self.called.lock().unwrap_or_else(PoisonError::into_inner);
+        if !called.contains(incarnation) {
+            called.insert(incarnation.to_owned());
+        }
+        Some(worker)
+    }
+
+    /// The workers that have called this process since the last question, and how long ago, milliseconds.
+    pub fn take_seen(&self) -> Vec<(String, u64)> {
+        let called = std::mem::take(&mut *self.called.lock().unwrap_or_else(PoisonError::into_inner));
+        let now_ms = self.clock.now_ms();
+        let workers = self.workers.lock().unwrap_or_else(PoisonError::into_inner);
+        let seen = called.into_iter().filter_map(|incarnation| {
+            let silent_ms = now_ms.saturating_sub(workers.get(&incarnation)?.seen_ms);
+            Some((incarnation, silent_ms))
+        });
+        seen.collect()
+    }
+
+    /// Adds what other coordinators know of workers.
+    pub fn add_others(&self, others: Vec<SharedWorker>) {
+        let now_ms = self.clock.now_ms();
+        let mut workers = self.workers.lock().unwrap_or_else(PoisonError::into_inner);
+        for SharedWorker { incarnation, silent_ms, registered } in others {
+            let seen_ms = now_ms.saturating_sub(silent_ms);
+            // One that a coordinator of another version cannot read has to register again.
+            let new = registered.and_then(|row| serde_json::from_slice::<KnownWorker>(&row).ok());
+            match (workers.get_mut(&incarnation), new) {
+                (Some(known), new) => {
+                    let seen_ms = known.seen_ms.max(seen_ms);
+                    *known = KnownWorker { seen_ms, ..new.unwrap_or_else(|| known.clone()) };
+                }
+                (None, Some(new)) => drop(workers.insert(incarnation, KnownWorker { seen_ms, ..new })),
+                (None, None) => {}
+            }
+        }
     }
 
     /// Removes workers whose tokens are no longer valid, and returns their incarnations.
@@ -111,9 +155,14 @@ impl WorkerRegistry {
     /// Removes workers that have been silent for long, or the table would leak memory.
     pub fn forget_silent(&self) {
         let now_ms = self.clock.now_ms();
-        let limit_ms = 10 * u64::from(self.lease_ms);
+        let limit_ms = self.forget_after_ms();
         let mut workers = self.workers.lock().unwrap_or_else(PoisonError::into_inner);
         workers.retain(|_, worker| now_ms.saturating_sub(worker.seen_ms) <= limit_ms);
+    }
+
+    /// Time after which a silent worker is forgotten, milliseconds.
+    pub fn forget_after_ms(&self) -> u64 {
+        10 * u64::from(self.lease_ms)
     }
 
     /// Whether a worker has called within the duration of a lease.
@@ -123,12 +172,12 @@ impl WorkerRegistry {
 
     /// The mark of a worker; `None` if it is active.
     pub fn mark_of(&self, incarnation: &str) -> Option<WorkerMark> {
-        self.marks.lock().unwrap_or_else(PoisonError::into_inner).get(incarnation).cloned()
+        self.marks.lock().unwrap_or_else(PoisonError::into_inner).0.get(incarnation).cloned()
     }
 
     /// All marked workers.
     pub fn marked(&self) -> Vec<String> {
-        self.marks.lock().unwrap_or_else(PoisonError::into_inner).keys().cloned().collect()
+        self.marks.lock().unwrap_or_else(PoisonError::into_inner).0.keys().cloned().collect()
     }
 
     /// Whether a worker is draining.
@@ -140,11 +189,31 @@ impl WorkerRegistry {
     pub fn note_mark(&self, incarnation: &str, mark: Option<WorkerMark>) {
         let mut marks = self.marks.lock().unwrap_or_else(PoisonError::into_inner);
         match mark {
-            Some(mark) => drop(marks.insert(incarnation.to_owned(), mark)),
-            None => drop(marks.remove(incarnation)),
+            Some(mark) => drop(marks.0.insert(incarnation.to_owned(), mark)),
+            None => drop(marks.0.remove(incarnation)),
         }
+        marks.1 += 1;
         drop(marks);
         self.connected.lock().unwrap_or_else(PoisonError::into_inner).0 = 0;
+    }
+
+    /// The number of marks that this process has changed.
+    pub fn marks_version(&self) -> u64 {
+        self.marks.lock().unwrap_or_else(PoisonError::into_inner).1
+    }
+
+    /// Takes over the stored marks, which were read when this process had changed `version` of them; returns
+    /// whether there are other ones than before.
+    pub fn set_marks(&self, version: u64, stored: Vec<(String, WorkerMark)>) -> bool {
+        let stored: HashMap<String, WorkerMark> = stored.into_iter().collect();
+        let mut marks = self.marks.lock().unwrap_or_else(PoisonError::into_inner);
+        if marks.1 != version || marks.0 == stored {
+            return false;
+        }
+        marks.0 = stored;
+        drop(marks);
+        self.connected.lock().unwrap_or_else(PoisonError::into_inner).0 = 0;
+        true
     }
 
     /// The active workers that have called within a lease's duration. The answer is cached briefly, because

@@ -1,4 +1,4 @@
-//! How a client reaches a coordinator: its address, TLS, and the client's token.
+//! How a client reaches a coordinator: its addresses, TLS, and the client's token.
 
 use std::fmt;
 use std::path::{Path, PathBuf};
@@ -13,6 +13,13 @@ use tonic::{GrpcMethod, Request, Status};
 use tonic_types::StatusExt;
 
 mod misdialled;
+mod transport;
+
+#[cfg(test)]
+mod several_tests;
+
+pub use transport::Transport;
+use transport::{Address, Several};
 
 /// Timeout of a connection attempt.
 const CONNECT_WITHIN: Duration = Duration::from_secs(5);
@@ -20,6 +27,9 @@ const CONNECT_WITHIN: Duration = Duration::from_secs(5);
 /// hours.
 const KEEPALIVE_EVERY: Duration = Duration::from_secs(20);
 const KEEPALIVE_TIMEOUT: Duration = Duration::from_secs(10);
+/// The same where there is another address to move to. A machine that dies silently then costs at most twice
+/// this, so a worker renews its leases of a minute elsewhere before they expire.
+const KEEPALIVE_OF_SEVERAL: Duration = Duration::from_secs(5);
 
 /// Default timeout of a call; Claim, the call that waits longest, waits for half of it.
 const ANSWER_WITHIN: Duration = Duration::from_secs(60);
@@ -31,12 +41,13 @@ const LOOKS_AT_EVERYTHING: [&str; 4] = ["BeginUpload", "CommitDataset", "CreateJ
 const LONGER: u32 = 30;
 
 /// A connection that adds the token and a deadline to every call.
-pub type Connection = InterceptedService<Channel, Credentials>;
+pub type Connection = InterceptedService<Transport, Credentials>;
 
-/// Address of a coordinator and connection settings.
+/// Addresses of a coordinator and connection settings.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Dial {
-    /// `http://HOST:PORT`, or `https://` with TLS.
+    /// `http://HOST:PORT`, or `https://` with TLS; several with commas between them. There is one connection
+    /// at a time, to the first address that answers; when it is lost, the next address is tried first.
     pub url: String,
     /// Certificate authorities that verify the coordinator's certificate, PEM; `None`: those of the system.
     pub tls_ca: Option<PathBuf>,
@@ -174,9 +185,11 @@ impl Default for Dial {
 }
 
 impl Dial {
-    /// In plain text, without a token; `http://` is added if there is no scheme.
+    /// In plain text, without a token; `http://` is added where there is no scheme.
     pub fn to(url: &str) -> Self {
-        let url = if url.contains("://") { url.to_owned() } else { format!("http://{url}") };
+        let with_scheme =
+            |one: &str| if one.contains("://") { one.to_owned() } else { format!("http://{one}") };
+        let url = url.split(',').map(|one| with_scheme(one.trim())).collect::<Vec<_>>().join(",");
         let answer_within = ANSWER_WITHIN;
         Self {
             url,
@@ -192,14 +205,15 @@ impl Dial {
     /// A connection that is made on first use, and again whenever it is lost.
     ///
     /// # Errors
-    /// When the address or a file cannot be used, or the token would be sent in plain text.
+    /// When an address or a file cannot be used, or the token would be sent in plain text.
     pub fn lazily(&self) -> Result<Connection, DialError> {
-        let (endpoint, credentials) = self.prepare()?;
-        let channel = match &self.connector {
-            Some(Connector(connect)) => connect(&endpoint),
-            None => endpoint.connect_lazy(),
+        let (addresses, credentials) = self.prepare()?;
+        let transport = match (addresses.as_slice(), &self.connector) {
+            ([only], Some(Connector(connect))) => Transport::one(connect(&only.endpoint)),
+            ([only], None) => Transport::one(only.endpoint.connect_lazy()),
+            _ => Transport::several(Several::of(addresses, self.connector.clone())),
         };
-        Ok(InterceptedService::new(channel, credentials))
+        Ok(InterceptedService::new(transport, credentials))
     }
 
     /// An established connection; with a custom connector, one that is made on first use.
@@ -210,20 +224,47 @@ impl Dial {
         if self.connector.is_some() {
             return self.lazily();
         }
-        let (endpoint, credentials) = self.prepare()?;
-        match endpoint.connect().await {
-            Ok(channel) => Ok(InterceptedService::new(channel, credentials)),
-            Err(error) => {
-                let said = root_cause(&error);
-                Err(match self.other_protocol().await.or_else(|| self.fault_of_tls(&said)) {
-                    Some(error) => error,
-                    None => DialError::Connect(said),
-                })
+        let (addresses, credentials) = self.prepare()?;
+        let transport = if let [only] = addresses.as_slice() {
+            match only.endpoint.connect().await {
+                Ok(channel) => Transport::one(channel),
+                Err(error) => {
+                    let said = root_cause(&error);
+                    return Err(match self.fault_of_connecting(&said).await {
+                        Some(error) => error,
+                        None => DialError::Connect(said),
+                    });
+                }
             }
-        }
+        } else {
+            let several = Several::of(addresses, None);
+            match several.connect().await {
+                Ok(()) => Transport::several(several),
+                Err(unanswered) => return Err(self.fault_of_each(unanswered).await),
+            }
+        };
+        Ok(InterceptedService::new(transport, credentials))
     }
 
-    fn prepare(&self) -> Result<(Endpoint, Credentials), DialError> {
+    /// The same for each address alone.
+    fn each(&self) -> impl Iterator<Item = Self> {
+        self.url.split(',').map(|url| Self { url: url.trim().to_owned(), ..self.clone() })
+    }
+
+    fn prepare(&self) -> Result<(Vec<Address>, Credentials), DialError> {
+        let are_several = self.url.contains(',');
+        let addresses: Vec<_> =
+            self.each().map(|one| one.address(are_several)).collect::<Result<_, DialError>>()?;
+        let scheme = |address: &Address| address.endpoint.uri().scheme().cloned();
+        if addresses.windows(2).any(|pair| scheme(&pair[0]) != scheme(&pair[1])) {
+            let message = "several addresses must all begin with http://, or all with https://".to_owned();
+            return Err(DialError::Url { url: self.url.clone(), message });
+        }
+        Ok((addresses, self.credentials()?))
+    }
+
+    /// The only address, as one of several or not.
+    fn address(&self, is_of_several: bool) -> Result<Address, DialError> {
         let wrong = |message: String| DialError::Url { url: self.url.clone(), message };
         let mut endpoint =
             Endpoint::from_shared(self.url.clone()).map_err(|error| wrong(root_cause(&error)))?;
@@ -241,13 +282,17 @@ impl Dial {
         } else if self.token.is_some() && !is_here && !self.insecure {
             return Err(DialError::PlainToken(self.url.clone()));
         }
-        let endpoint = endpoint
-            .connect_timeout(CONNECT_WITHIN)
-            .http2_keep_alive_interval(KEEPALIVE_EVERY)
-            .keep_alive_timeout(KEEPALIVE_TIMEOUT)
-            .keep_alive_while_idle(true)
-            .tcp_nodelay(true);
-        Ok((endpoint, self.credentials()?))
+        let endpoint = if is_of_several {
+            // The timeout of a connection attempt is that of `transport`.
+            endpoint.http2_keep_alive_interval(KEEPALIVE_OF_SEVERAL).keep_alive_timeout(KEEPALIVE_OF_SEVERAL)
+        } else {
+            endpoint
+                .connect_timeout(CONNECT_WITHIN)
+                .http2_keep_alive_interval(KEEPALIVE_EVERY)
+                .keep_alive_timeout(KEEPALIVE_TIMEOUT)
+        };
+        let endpoint = endpoint.keep_alive_while_idle(true).tcp_nodelay(true);
+        Ok(Address { url: self.url.clone(), endpoint })
     }
 
     fn tls(&self) -> Result<ClientTlsConfig, DialError> {

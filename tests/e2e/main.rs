@@ -34,3 +34,4 @@ mod store;
 #[cfg(unix)]
 mod store_faults;
 mod train;
+mod two_coordinators;

@@ -131,6 +131,23 @@ fn a_service_moves_to_a_database_and_back() {
     assert_eq!(submit(&[]), job, "a repeated request made another job");
 }
 
+/// Lines of an attempt that is so long that lines in its middle were removed.
+fn write_long_log(folder: &Path) {
+    std::fs::create_dir_all(folder).expect("a folder");
+    for (segment, lines) in [(0, 1..=300), (3, 1001..=1300)] {
+        let line = |number: u64| {
+            let message = format!("line {number}");
+            let row = serde_json::json!({
+                "number": 2 * number, "from_worker": number, "time_ms": 1_700_000_000_000_u64 + number,
+                "severity": "info", "worker": "reef", "message": message,
+            });
+            format!("{row}\n")
+        };
+        let text: String = lines.map(line).collect();
+        std::fs::write(folder.join(format!("global.1.{segment}")), text).expect("written");
+    }
+}
+
 #[test]
 fn a_service_moves_to_a_database_and_a_bucket_and_back() {
     let Some(database) = crate::postgres::database() else { return };
@@ -150,34 +167,40 @@ fn a_service_moves_to_a_database_and_a_bucket_and_back() {
         assert!(succeeded, "{said}");
         let moved: serde_json::Value = serde_json::from_str(&said).expect("JSON");
         assert_eq!((&moved["jobs"], &moved["faults"]), (&1.into(), &serde_json::json!([])), "{moved}");
-        moved["copied_blobs"].as_u64().expect("a number")
+        ["copied_blobs", "copied_log_lines"].map(|count| moved[count].as_u64().expect("a number"))
     };
-    // The same request at each coordinator: it makes one job.
+    // The same request at each coordinator: it makes one job. With the lines of its logs.
     let submit = |flags: &[&str]| {
         let flags = [&["coordinator", "--listen", "127.0.0.1:0"], flags].concat();
         let keys = keys.each_ref().map(|(name, value)| (*name, value.as_str()));
         let mut service = Service::with_environment(&flags, Stdio::piped(), Stdio::inherit(), &keys);
         let url = service.wait_until_it_listens();
         let words = ["submit", &scene, "--coordinator", &url, "--iterations=50", "--request-id=once"];
-        succeed(&words).trim().to_owned()
+        let job = succeed(&words).trim().to_owned();
+        let lines = succeed(&["logs", &job, "--json", "--coordinator", &url]);
+        (job, lines)
     };
-    let job = submit(&["--data-dir", &data]);
-    std::fs::create_dir_all(at("data/logs/of-a-job")).expect("a folder");
-    std::fs::write(at("data/logs/of-a-job/line"), "a line").expect("written");
+    let (job, _) = submit(&["--data-dir", &data]);
+    write_long_log(&Path::new(&data).join("logs").join(&job));
+    let (_, lines) = submit(&["--data-dir", &data]);
+    assert!(lines.lines().count() > 600 && lines.contains("lines were removed here"), "{lines}");
+    // The coordinator may have added lines of its own.
+    let continues = |(again, its_lines): (String, String)| {
+        assert_eq!(again, job, "a repeated request made another job");
+        assert!(its_lines.starts_with(&lines), "lines differ: {its_lines}");
+    };
 
     let to = ["--to-data-dir", &away, "--to-store", &database, "--to-objects", &objects];
-    assert!(moved(&[&["--data-dir", &data], &to[..]].concat()) > 64);
-    assert_eq!(
-        moved(&[&["--data-dir", &data], &to[..]].concat()),
-        0,
-        "a second move copies everything again"
-    );
-    assert_eq!(std::fs::read_to_string(at("away/logs/of-a-job/line")).expect("the log"), "a line");
+    let [blobs, log_lines] = moved(&[&["--data-dir", &data], &to[..]].concat());
+    assert!(blobs > 64 && log_lines >= 600, "{blobs} blobs, {log_lines} log lines");
+    let again = moved(&[&["--data-dir", &data], &to[..]].concat());
+    assert_eq!(again, [0, 0], "a second move copies everything again");
+    assert!(!Path::new(&at("away/logs")).exists(), "log lines are in the database");
     assert!(!Path::new(&at("away/objects/cas")).exists(), "files are in the bucket");
     let there = ["--data-dir", &away, "--store", &database, "--objects", &objects];
     let (succeeded, said) = with_keys(&[&["store", "verify", "--deep"], &there[..]].concat());
     assert!(succeeded, "{said}");
-    assert_eq!(submit(&there), job, "a repeated request made another job");
+    continues(submit(&there));
 
     // A coordinator of other jobs would delete these files.
     let other = at("other");
@@ -194,8 +217,9 @@ fn a_service_moves_to_a_database_and_a_bucket_and_back() {
     let (_, said) = fail(&["coordinator", "--data-dir", &other, "--objects=reef", "--listen=127.0.0.1:0"]);
     assert!(said.contains("objects = \"reef\""), "{said}");
 
-    moved(&[&there[..], &["--to-data-dir", &back]].concat());
-    assert_eq!(submit(&["--data-dir", &back]), job, "a repeated request made another job");
+    let [_, log_lines] = moved(&[&there[..], &["--to-data-dir", &back]].concat());
+    assert!(log_lines >= 600, "{log_lines} log lines");
+    continues(submit(&["--data-dir", &back]));
     succeed(&["store", "verify", "--data-dir", &back, "--deep"]);
 }
 

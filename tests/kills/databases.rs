@@ -57,6 +57,51 @@ fn a_bucket_that_fails_costs_no_task() {
 }
 
 #[test]
+fn one_of_two_coordinators_is_killed_for_good() {
+    let scenario = "one_of_two_coordinators_is_killed_for_good";
+    if !can_train(scenario) {
+        return;
+    }
+    let Some(mut harness) = Harness::on_database(scenario) else { return };
+    harness.announce_second();
+    harness.start_second();
+    harness.start_worker("first");
+    let job = harness.submit();
+    job.wait_for_checkpoint("partition-0000");
+    harness.kill_coordinator();
+    let history = harness.succeeded(&job);
+    assert_eq!(history.losses(), 0, "a live worker was counted as lost\n{history}");
+    let lines = harness.ask(&["logs", &job.id]);
+    for task in ["plan", "partition-0000", "partition-0001", "merge"] {
+        assert!(lines.contains(task), "the log lacks the lines of {task}: {lines}");
+    }
+    harness.check_data_dir();
+}
+
+#[test]
+fn a_coordinator_dies_in_a_merge_and_another_merges() {
+    let scenario = "a_coordinator_dies_in_a_merge_and_another_merges";
+    if !can_train(scenario) {
+        return;
+    }
+    let Some(mut harness) = Harness::on_database(scenario) else { return };
+    harness.announce_second();
+    harness.start_worker("first");
+    let job = harness.submit();
+    harness.hold_merge(&job);
+    job.wait_until_leased("merge");
+    // Its start takes no lease from the first one, which holds the merge.
+    harness.start_second();
+    std::thread::sleep(Duration::from_millis(harness.rules.lease_ms * 2));
+    let merge = harness.task(&job, "merge");
+    assert_eq!((&merge["state"], &merge["attempts"]), (&"running".into(), &1.into()), "{merge:#}");
+    harness.kill_coordinator();
+    let history = harness.succeeded(&job);
+    assert_eq!((history.losses(), history.leases("merge").len()), (0, 2), "{history}");
+    harness.check_data_dir();
+}
+
+#[test]
 fn a_coordinator_serves_only_the_jobs_of_its_files() {
     let scenario = "a_coordinator_serves_only_the_jobs_of_its_files";
     if !can_train(scenario) {

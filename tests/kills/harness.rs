@@ -48,6 +48,8 @@ pub struct Harness {
     pub port: u16,
     pub rules: Rules,
     coordinator: Option<Process>,
+    /// The port of a second one on the same database and bucket, and the process once it is started.
+    second: Option<(u16, Option<Process>)>,
     /// The database of its jobs, and its URL; without one, they are in the data directory.
     database: Option<(Server, String)>,
     /// The server of its files; without one, they are in the data directory.
@@ -110,6 +112,7 @@ impl Harness {
             port: free_port(),
             rules,
             coordinator: None,
+            second: None,
             database: None,
             bucket: None,
             workers: BTreeMap::new(),
@@ -118,8 +121,13 @@ impl Harness {
         }
     }
 
+    /// The address of the coordinator, or of both.
     pub fn url(&self) -> String {
-        format!("http://127.0.0.1:{}", self.port)
+        let first = format!("http://127.0.0.1:{}", self.port);
+        match &self.second {
+            Some((port, _)) => format!("{first},http://127.0.0.1:{port}"),
+            None => first,
+        }
     }
 
     /// A path in the folder of this scenario, as an argument.
@@ -143,8 +151,28 @@ impl Harness {
         begin.elapsed()
     }
 
+    /// Tells clients and workers from now on of a second coordinator, which is started later.
+    pub fn announce_second(&mut self) {
+        self.second = Some((free_port(), None));
+    }
+
+    /// Starts the second coordinator.
+    pub fn start_second(&mut self) {
+        let (port, _) = self.second.take().expect("it was announced");
+        let (first_port, first_data) = (self.port, self.data.clone());
+        let first = self.coordinator.take();
+        (self.port, self.data) = (port, self.folder.path().join("second-data"));
+        assert!(self.try_named("second"), "the second coordinator did not start");
+        self.second = Some((port, self.coordinator.take()));
+        (self.port, self.data, self.coordinator) = (first_port, first_data, first);
+    }
+
     /// As [`Harness::start_coordinator`], but may fail; returns whether it serves.
     pub fn try_coordinator(&mut self) -> bool {
+        self.try_named("coordinator")
+    }
+
+    fn try_named(&mut self, name: &str) -> bool {
         let Rules { lease_ms, max_losses, min_free_bytes } = &self.rules;
         let mut arguments = vec![
             "coordinator".to_owned(),
@@ -158,8 +186,7 @@ impl Harness {
         ];
         arguments.extend(self.database.as_ref().map(|(_, url)| format!("--store={url}")));
         arguments.extend(self.bucket.as_ref().map(|bucket| format!("--objects={}", bucket.url(PREFIX))));
-        let mut process =
-            Process::start_in("coordinator", &arguments, &self.environment(), &self.log_folder());
+        let mut process = Process::start_in(name, &arguments, &self.environment(), &self.log_folder());
         let ready = process.line().is_some_and(|line| line.starts_with("listening on http://"));
         self.coordinator = Some(process);
         ready
@@ -317,7 +344,9 @@ impl Harness {
         let history = History::of(events.lines().filter_map(|line| serde_json::from_str(line).ok()));
         let mut faults = history.faults(&shown, self.rules.max_losses);
         faults.extend(history.differences(&job.seen()));
-        for (_, log) in self.logs().iter().filter(|(name, _)| name != "coordinator") {
+        for (_, log) in
+            self.logs().iter().filter(|(name, _)| !["coordinator", "second"].contains(&name.as_str()))
+        {
             faults.extend(history.lacks(&job.id, &Acknowledged::in_log(log)));
         }
         assert!(faults.is_empty(), "job {}: {faults:#?}\n{history}", job.id);
@@ -354,6 +383,7 @@ impl Harness {
         }
         // Processes that were already killed stay dead.
         self.workers.clear();
+        self.second = None;
         self.kill_coordinator();
         let data = self.data.to_string_lossy().into_owned();
         let mut verify = vec!["store", "verify", "--data-dir", &data, "--deep", "--json"];

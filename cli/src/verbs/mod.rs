@@ -157,7 +157,8 @@ impl Verb {
 /// The address of a service, and the connection to it.
 #[derive(Args, Clone, Debug)]
 pub struct ServiceArgs {
-    /// URL of the coordinator
+    /// URL of the coordinator, or several with commas between them: the first that answers is used, and the
+    /// next one when it is lost
     #[arg(long, value_name = "URL", help_heading = HEADING)]
     #[arg(env = "FATHOM_COORDINATOR", default_value = "http://127.0.0.1:7420")]
     pub coordinator: String,

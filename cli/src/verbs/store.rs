@@ -149,7 +149,7 @@ pub async fn run(args: StoreArgs) -> Result<()> {
                 let Counts { jobs, tasks, events, datasets } = counts;
                 output::json(&json!({
                     "jobs": jobs, "tasks": tasks, "events": events, "datasets": datasets,
-                    "copied_blobs": blobs, "copied_bytes": bytes, "copied_logs": logs,
+                    "copied_blobs": blobs, "copied_bytes": bytes, "copied_log_lines": logs,
                     "damaged": damaged, "faults": faults,
                 }))?;
             } else {
@@ -157,7 +157,7 @@ pub async fn run(args: StoreArgs) -> Result<()> {
                     output::line(format!("blob {digest} is damaged; it was not copied"));
                 });
                 faults.iter().for_each(output::line);
-                let rest = format!("{blobs} blobs of {bytes} bytes and {logs} files of logs copied to {to}");
+                let rest = format!("{blobs} blobs of {bytes} bytes and {logs} log lines copied to {to}");
                 print_counts(counts, false, &rest)?;
             }
             match faults.len() {

@@ -50,7 +50,8 @@ struct RunArgs {
 /// connection.
 #[derive(Args, Debug, Serialize)]
 pub struct WorkerSettings {
-    /// URL of the coordinator
+    /// URL of the coordinator, or several with commas between them: the first that answers is used, and the
+    /// next one when it is lost
     #[arg(long, value_name = "URL", help_heading = HEADING, env = "FATHOM_COORDINATOR")]
     coordinator: Option<String>,
     #[command(flatten)]

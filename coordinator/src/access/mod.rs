@@ -60,7 +60,7 @@ impl FromStr for Role {
 }
 
 /// A caller.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Principal {
     /// The name of the token, for display.
     pub name: String,

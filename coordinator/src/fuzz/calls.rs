@@ -3,6 +3,7 @@
 
 use std::cell::{Cell, RefCell};
 use std::collections::HashMap;
+use std::sync::atomic::AtomicU32;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
@@ -91,7 +92,7 @@ impl Coordinator {
         let folder = Folder::new(name);
         let objects = {
             let at = ObjectsAt::Folder(folder.path().to_owned());
-            TenantBlobs::open(at, folder.path(), 0, Clock::start()).await.unwrap()
+            TenantBlobs::open(at, folder.path(), 0, Clock::start(), None).await.unwrap()
         };
         let manifest = objects.of(&Tenant::default()).await.unwrap().put(ANYTHING.into()).await.unwrap();
         let store = MemoryStore::new(Rules::default(), 30_000, 0);
@@ -130,6 +131,7 @@ impl Coordinator {
             lease_ms: 30_000,
             wakeups: Wakeups::default(),
             stopping: stop_signal,
+            members: Arc::new(AtomicU32::new(1)),
             workers: WorkerRegistry::new(clock, 30_000, HashMap::new()),
             gaps: Mutex::new(HashMap::new()),
             revoking: Default::default(),

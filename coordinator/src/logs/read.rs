@@ -5,37 +5,17 @@ use std::collections::{BTreeMap, BinaryHeap, VecDeque};
 use std::io;
 use std::path::Path;
 
+use super::files::{Folders, lock};
 use super::segment::{Files, path, rows_from};
-use super::{Attempt, JobLogs, KeptLine, Row, Severity, lock};
-use crate::schedule::{JobId, TaskId};
-
-/// Maximum lines examined in one call, so that a selective reader can be stopped in between.
-const LOOKED_AT: usize = 4096;
-/// The notice in place of removed lines.
-const CUT: &str = "lines were removed here: of a long attempt only the first and the latest are kept";
-
-/// A filter of lines.
-#[derive(Clone, Debug)]
-pub struct Wanted {
-    /// The task; `None` for all.
-    pub task: Option<TaskId>,
-    /// The attempt; `None` for all.
-    pub attempt: Option<u32>,
-    /// The minimum severity.
-    pub severity: Severity,
-}
-
-impl Wanted {
-    fn admits(&self, (task, attempt): Attempt) -> bool {
-        self.task.is_none_or(|wanted| wanted == task) && self.attempt.is_none_or(|wanted| wanted == attempt)
-    }
-}
+use super::{Attempt, KeptLine, LOOKED_AT, Row, Wanted};
+use crate::schedule::JobId;
 
 /// Position of a reader.
 #[derive(Default)]
 pub struct Position {
     /// The number up to which everything was read.
     pub number: u64,
+    /// Only of a reader of files.
     cursors: BTreeMap<Attempt, Cursor>,
 }
 
@@ -57,13 +37,13 @@ struct Cursor {
     rows: VecDeque<Row>,
 }
 
-impl JobLogs {
+impl Folders {
     /// The next lines after `position`, at most `limit`, and whether there may be more at once; advances
     /// `position`.
     ///
     /// # Errors
     /// When a file cannot be read.
-    pub fn read(
+    pub(super) fn read(
         &self,
         job: &JobId,
         wanted: &Wanted,
@@ -137,10 +117,7 @@ impl Cursor {
             if std::mem::take(&mut self.after_cut)
                 && let Some(first) = rows.first()
             {
-                let (from_worker, severity, message) = (None, Severity::Warn, CUT.to_owned());
-                // No line has this number, which is odd.
-                let number = first.number - 1;
-                self.rows.push_back(Row { number, from_worker, severity, message, ..first.clone() });
+                self.rows.push_back(first.notice());
             }
             self.rows.extend(rows);
             if end > self.offset {

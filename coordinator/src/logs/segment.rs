@@ -4,7 +4,8 @@ use std::fs::{self, File};
 use std::io::{self, Read as _, Seek as _, SeekFrom, Write as _};
 use std::path::{Path, PathBuf};
 
-use super::{Attempt, JobLog, Row};
+use super::files::JobLog;
+use super::{Attempt, Row};
 
 /// Upper bound of a row: a message has 4096 bytes, and each may take six in JSON.
 pub const MAX_ROW_BYTES: u64 = 32 << 10;
@@ -26,6 +27,8 @@ pub struct Files {
     bytes: u64,
     /// Whether the last segment ends in the middle of a line.
     torn: bool,
+    /// Whether lines before the next one were removed: it begins a segment that does not follow the last one.
+    pub is_cut: bool,
     /// The highest number from its worker; `None` until it is read.
     pub from_worker: Option<u64>,
 }
@@ -125,21 +128,24 @@ impl Files {
         !self.segments.is_empty() && self.bytes + bytes as u64 <= segment_bytes
     }
 
-    /// Appends complete lines; when the last segment is full, begins a new one and removes an old one.
+    /// Appends complete lines; when the last segment is full, begins a new one and removes an old one, so
+    /// that at most `segments` are left.
     pub fn write(
         &mut self,
         folder: &Path,
         attempt: Attempt,
         lines: &[u8],
         segment_bytes: u64,
+        segments: usize,
     ) -> io::Result<()> {
         let mut segment = self.segments.last().copied();
-        if !self.has_room(lines.len(), segment_bytes) && (self.bytes > 0 || segment.is_none()) {
-            let next = segment.map_or(0, |segment| segment + 1);
+        let is_cut = std::mem::take(&mut self.is_cut) && segment.is_some();
+        if is_cut || !self.has_room(lines.len(), segment_bytes) && (self.bytes > 0 || segment.is_none()) {
+            let next = segment.map_or(0, |segment| segment + if is_cut { 2 } else { 1 });
             self.segments.push(next);
             (self.bytes, self.torn, segment) = (0, false, Some(next));
             // The first segment and the latest ones stay.
-            while self.segments.len() as u64 > super::SEGMENTS {
+            while self.segments.len() > segments {
                 remove(&path(folder, attempt, self.segments.remove(1)))?;
             }
         }

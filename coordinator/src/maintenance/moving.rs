@@ -4,7 +4,7 @@
 //! Everything is copied, and the source stays as it is. Files come first, then logs, then rows: a coordinator
 //! on the new place never sees a job without its files. A move that was interrupted goes on where it stopped.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -15,9 +15,10 @@ use super::{Counts, Place, Verified, open_copy, open_database, store_of, verify}
 use crate::clock::Clock;
 use crate::data_dir;
 use crate::error::CoordinatorError;
+use crate::logs::{self, JobLogs, Logs};
 use crate::objects::{BlobStore, ObjectError, ObjectsAt, TenantBlobs};
 use crate::store::export::Export;
-use crate::store::{SledStore, Store};
+use crate::store::{Hold, SledStore, Store};
 
 /// Blobs that are copied at a time.
 const BLOBS_AT_ONCE: usize = 8;
@@ -33,7 +34,7 @@ pub struct Moved {
     pub blobs: u64,
     /// Their bytes.
     pub bytes: u64,
-    /// Files of logs that were copied.
+    /// Log lines of jobs that were copied; others were there.
     pub logs: u64,
     /// Digests of blobs that are damaged at the source, and were left out.
     pub damaged: Vec<String>,
@@ -63,19 +64,22 @@ pub async fn move_service(
             )));
         };
         to_objects.hold_for(name, &to.data_dir).await?;
-        copy_objects(&source.export, &from_objects, to_objects, &to.data_dir, &mut moved).await?;
+        // Blobs that are copied into a bucket count in the rows of the database that will have the jobs.
+        let rows = match &to.store {
+            Some(url) => Some(open_database(url).await?),
+            None => None,
+        };
+        let ledger = rows.as_ref().and_then(Store::ledger);
+        let to_blobs = TenantBlobs::open(to_objects, &to.data_dir, 0, Clock::start(), ledger).await?;
+        copy_objects(&source.export, &from_objects, &to_blobs, &mut moved).await?;
     }
-    if from.data_dir != to.data_dir {
-        let (logs, to_logs) = (from.data_dir.join("logs"), to.data_dir.join("logs"));
-        let copied = tokio::task::spawn_blocking(move || copy_folder(&logs, &to_logs)).await;
-        moved.logs = copied.map_err(|error| CoordinatorError::Maintenance(error.to_string()))??;
-    }
+    // Log lines are where the rows are.
     let shares_rows = match (&from.store, &to.store) {
         (None, None) => from.data_dir == to.data_dir,
         (one, other) => one == other,
     };
     if !shares_rows {
-        import(&source.export, to).await?;
+        moved.logs = import(&source, to).await?;
     }
     drop(source);
     let Verified { counts, faults, .. } = verify(to, scratch, false).await?;
@@ -95,9 +99,10 @@ fn is_same(one: &ObjectsAt, other: &ObjectsAt) -> bool {
     }
 }
 
-/// All rows of a place, and what keeps coordinators away from it meanwhile.
+/// All rows of a place, its logs, and what keeps coordinators away from it meanwhile.
 struct Source {
     export: Export,
+    logs: Arc<dyn Logs>,
     _held: Box<dyn Store>,
 }
 
@@ -105,43 +110,49 @@ async fn read_source(from: &Place, scratch: Option<&Path>) -> Result<Source, Coo
     let held: Box<dyn Store> = match &from.store {
         Some(url) => {
             let store = open_database(url).await?;
-            store.hold_alone(None).await?;
+            store.hold(Hold::Alone, None).await?;
             Box::new(store)
         }
         None => Box::new(open_copy(&from.data_dir, scratch)?),
     };
-    Ok(Source { export: held.export().await?, _held: held })
+    let logs = logs::of(held.as_ref(), &from.data_dir, logs::ATTEMPT_BYTES);
+    Ok(Source { export: held.export().await?, logs, _held: held })
 }
 
-/// Writes the rows. Those of this export may be there already, from an interrupted move.
-async fn import(export: &Export, to: &Place) -> Result<(), CoordinatorError> {
+/// Writes logs and rows; returns the number of new log lines. Those of this export may be there already, from
+/// an interrupted move.
+async fn import(Source { export, logs, .. }: &Source, to: &Place) -> Result<u64, CoordinatorError> {
     if let Some(url) = &to.store {
         let store = open_database(url).await?;
-        store.hold_alone(None).await?;
+        // Before the logs: a coordinator would remove those of jobs that it does not know.
+        store.hold(Hold::Alone, None).await?;
+        let to_logs = logs::of(&store, &to.data_dir, logs::ATTEMPT_BYTES);
+        let copied = logs::copy(logs.as_ref(), to_logs.as_ref()).await?;
         if store.export().await? != *export {
             store.import(export).await?;
         }
         store.close().await;
-        return Ok(());
+        return Ok(copied);
     }
+    let to_logs = JobLogs::new(&to.data_dir.join("logs"), logs::ATTEMPT_BYTES);
+    let copied = logs::copy(logs.as_ref(), &to_logs).await?;
     if store_of(&to.data_dir).is_ok() {
         let known = SledStore::open_copy(&super::options(&to.data_dir.join("store")), None)?;
         if known.export().await? == *export {
-            return Ok(());
+            return Ok(copied);
         }
     }
-    super::import_into_folder(export, &to.data_dir).await
+    super::import_into_folder(export, &to.data_dir).await?;
+    Ok(copied)
 }
 
 /// Copies the blobs of all tenants.
 async fn copy_objects(
     export: &Export,
     from: &ObjectsAt,
-    to: ObjectsAt,
-    data_dir: &Path,
+    to: &TenantBlobs,
     moved: &mut Moved,
 ) -> Result<(), CoordinatorError> {
-    let to = TenantBlobs::open(to, data_dir, 0, Clock::start()).await?;
     let of_jobs = export.jobs.iter().map(|job| &job.job.tenant);
     let tenants: std::collections::BTreeSet<_> =
         of_jobs.chain(export.datasets.iter().map(|dataset| &dataset.tenant)).collect();
@@ -193,30 +204,4 @@ async fn copy_blob(from: &BlobStore, to: &Arc<BlobStore>, blob: &BlobRef) -> Res
     }
     writer.finish().await?;
     Ok(true)
-}
-
-/// Copies the files below a folder that are missing or shorter there; returns their number.
-fn copy_folder(from: &Path, to: &Path) -> Result<u64, CoordinatorError> {
-    let failed = |path: PathBuf| {
-        move |error: std::io::Error| CoordinatorError::Maintenance(format!("{}: {error}", path.display()))
-    };
-    if !from.is_dir() {
-        return Ok(0);
-    }
-    std::fs::create_dir_all(to).map_err(failed(to.to_owned()))?;
-    let mut copied = 0;
-    for entry in std::fs::read_dir(from).map_err(failed(from.to_owned()))? {
-        let path = entry.map_err(failed(from.to_owned()))?.path();
-        let target = to.join(path.file_name().unwrap_or_default());
-        if path.is_dir() {
-            copied += copy_folder(&path, &target)?;
-            continue;
-        }
-        let bytes = |path: &Path| path.metadata().map(|meta| meta.len()).ok();
-        if bytes(&path) != bytes(&target) {
-            std::fs::copy(&path, &target).map_err(failed(path.clone()))?;
-            copied += 1;
-        }
-    }
-    Ok(copied)
 }

@@ -18,6 +18,7 @@ use object_store::{MultipartUpload, ObjectMeta, ObjectStore, ObjectStoreExt};
 
 use super::disk::spawn_io;
 use super::garbage::Removed;
+use super::shared::SharedRows;
 use super::{ObjectError, check_digest, object_path};
 use crate::clock::Clock;
 
@@ -88,6 +89,11 @@ impl Bucket {
         &self.store
     }
 
+    /// Now, by the clock of ages.
+    pub fn now(&self) -> SystemTime {
+        self.clock.system_time()
+    }
+
     /// Lists all of it.
     pub async fn content(&self) -> Result<Content, ObjectError> {
         let mut content = Content::default();
@@ -123,7 +129,7 @@ impl Bucket {
     }
 
     /// What is known of an object; `None` if there is none.
-    async fn head(&self, path: &ObjectPath) -> Result<Option<ObjectMeta>, ObjectError> {
+    pub async fn head(&self, path: &ObjectPath) -> Result<Option<ObjectMeta>, ObjectError> {
         match self.store.head(path).await {
             Ok(meta) => Ok(Some(meta)),
             Err(object_store::Error::NotFound { .. }) => Ok(None),
@@ -246,7 +252,11 @@ impl Bucket {
     }
 
     /// Moves a blob aside if its bytes have another digest; returns its length, or `None` if they have not.
-    pub async fn set_aside_if_damaged(&self, digest: &str) -> Result<Option<u64>, ObjectError> {
+    pub async fn set_aside_if_damaged(
+        &self,
+        digest: &str,
+        shared: Option<&SharedRows>,
+    ) -> Result<Option<u64>, ObjectError> {
         let path = object_path(digest)?;
         let _alone = self.looking.lock().await;
         let Some(before) = self.head(&path).await? else { return Ok(None) };
@@ -262,14 +272,6 @@ impl Bucket {
         if self.only_looks {
             return Ok(Some(0));
         }
-        let _nobody_asks = self.checking.write().await;
-        // It may have been sent again meanwhile.
-        let is_same = |now: &ObjectMeta| {
-            (now.last_modified, &now.e_tag, now.size) == (before.last_modified, &before.e_tag, before.size)
-        };
-        if !self.head(&path).await?.is_some_and(|now| is_same(&now)) {
-            return Ok(None);
-        }
         // Buckets copy no object of more than 5 GB, and a long copy takes longer than a request may.
         let aside = ObjectPath::from_iter(["damaged", digest]);
         if before.size <= MOST_KEPT_BYTES {
@@ -278,8 +280,25 @@ impl Bucket {
         } else {
             tracing::error!(%digest, %found, bytes = before.size, "the bucket has changed a blob, which is too long to be kept");
         }
-        self.delete(vec![path], |_| ()).await?;
-        Ok(Some(before.size))
+        // It may have been sent again meanwhile.
+        let is_same = |now: &ObjectMeta| {
+            (now.last_modified, &now.e_tag, now.size) == (before.last_modified, &before.e_tag, before.size)
+        };
+        let remove = async {
+            if !self.head(&path).await?.is_some_and(|now| is_same(&now)) {
+                return Ok(false);
+            }
+            self.delete(vec![path.clone()], |_| ()).await?;
+            Ok(true)
+        };
+        let is_removed = match shared {
+            Some(shared) => shared.withdraw(digest, remove).await?,
+            None => {
+                let _nobody_asks = self.checking.write().await;
+                remove.await?
+            }
+        };
+        Ok(is_removed.then_some(before.size))
     }
 
     /// Removes objects that were last used or written before `before`, except the blobs `used` and the
@@ -332,15 +351,7 @@ impl Bucket {
             }
         }
         // An upload is as young as its youngest segment.
-        let mut uploads = BTreeMap::<String, Vec<ObjectMeta>>::new();
-        let mut segments = self.list("uploads");
-        while let Some(segment) = segments.try_next().await? {
-            uploads
-                .entry(digest_of_segment(&segment.location).unwrap_or_default())
-                .or_default()
-                .push(segment);
-        }
-        for (digest, segments) in uploads {
+        for (digest, segments) in self.uploads().await? {
             if !segments.iter().all(is_old) || is_written(&digest) {
                 continue;
             }

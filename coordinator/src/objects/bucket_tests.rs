@@ -26,29 +26,29 @@ fn store_of(server: &S3Server, retries: RetryConfig) -> Arc<dyn ObjectStore> {
     Arc::new(PrefixStore::new(builder.build().unwrap(), PREFIX))
 }
 
-fn at(server: &S3Server) -> ObjectsAt {
+pub(super) fn at(server: &S3Server) -> ObjectsAt {
     ObjectsAt::Bucket { url: server.url(PREFIX), store: store_of(server, place::retries()) }
 }
 
 /// The store of the default tenant, as after a start of the coordinator.
 async fn opened(server: &S3Server, data_dir: &Path) -> Arc<BlobStore> {
-    let blobs = TenantBlobs::open(at(server), data_dir, 0, Clock::start()).await.unwrap();
+    let blobs = TenantBlobs::open(at(server), data_dir, 0, Clock::start(), None).await.unwrap();
     blobs.of(&Tenant::default()).await.unwrap()
 }
 
-fn objects(server: &S3Server, path: &str) -> PathBuf {
+pub(super) fn objects(server: &S3Server, path: &str) -> PathBuf {
     server.folder(PREFIX).join("objects").join(path)
 }
 
-fn key(server: &S3Server, blob: &BlobRef) -> PathBuf {
+pub(super) fn key(server: &S3Server, blob: &BlobRef) -> PathBuf {
     objects(server, "cas").join(&blob.digest[..2]).join(&blob.digest)
 }
 
-fn content(bytes: usize) -> Vec<u8> {
+pub(super) fn content(bytes: usize) -> Vec<u8> {
     (0..bytes).map(|index| (index as u32).wrapping_mul(2_654_435_761).to_le_bytes()[3]).collect()
 }
 
-async fn send(store: &Arc<BlobStore>, content: &[u8], offset: usize, end: usize) -> BlobWriter {
+pub(super) async fn send(store: &Arc<BlobStore>, content: &[u8], offset: usize, end: usize) -> BlobWriter {
     let blob = BlobRef::of(content);
     let mut writer = store.begin_write(&blob, offset as u64, None).await.unwrap().unwrap();
     for at in (offset..end).step_by(1 << 20) {
@@ -79,9 +79,16 @@ async fn blobs_small_and_large_arrive_and_are_read() {
     let beyond = store.range(&BlobRef::of(&content(1)).digest, 0..2).await.unwrap_err();
     assert!(!matches!(beyond, ObjectError::NotFound(_)), "{beyond}");
     let total = (100_001 + 3 * PART_BYTES + 12_345) as u64;
-    assert_eq!(store.used_bytes(), total);
-    assert_eq!(opened(&server, dir.path()).await.used_bytes(), total, "the next process counts others");
-    assert_eq!(store.used_bytes(), opened(&server, dir.path()).await.used_bytes());
+    assert_eq!(store.used_bytes().await.unwrap(), total);
+    assert_eq!(
+        opened(&server, dir.path()).await.used_bytes().await.unwrap(),
+        total,
+        "the next process counts others"
+    );
+    assert_eq!(
+        store.used_bytes().await.unwrap(),
+        opened(&server, dir.path()).await.used_bytes().await.unwrap()
+    );
     let rest = object_count(&objects(&server, "uploads"));
     assert_eq!(rest, 0, "segments of complete uploads remain");
 }
@@ -104,7 +111,7 @@ async fn a_broken_upload_goes_on_in_another_process() {
     // This client disconnects: its writer is dropped, and the bytes are saved in the background.
     let store = opened(&server, dir.path()).await;
     assert_eq!(store.committed(&blob).await.unwrap(), (first as u64, false));
-    assert_eq!(store.used_bytes(), first as u64);
+    assert_eq!(store.used_bytes().await.unwrap(), first as u64);
     let second = 2 * PART_BYTES;
     drop(send(&store, &content, first, second).await);
     while matches!(store.begin_write(&blob, 0, None).await, Err(ObjectError::Busy(_))) {
@@ -118,7 +125,10 @@ async fn a_broken_upload_goes_on_in_another_process() {
     let store = opened(&server, dir.path()).await;
     send(&store, &content, second, content.len()).await.finish().await.unwrap();
     assert!(store.read(&blob).await.unwrap() == content);
-    assert_eq!((store.used_bytes(), store.declared_bytes(&blob.digest)), (content.len() as u64, 0));
+    assert_eq!(
+        (store.used_bytes().await.unwrap(), store.declared_bytes(&[&blob.digest]).await.unwrap()),
+        (content.len() as u64, 0)
+    );
 }
 
 #[tokio::test]
@@ -144,7 +154,7 @@ async fn bytes_that_differ_from_the_declaration_are_deleted() {
     let error = send(&store, &content, PART_BYTES, content.len()).await.finish().await.unwrap_err();
     assert!(matches!(error, ObjectError::DigestMismatch { .. }), "{error}");
     assert_eq!(store.committed(&BlobRef::of(&content)).await.unwrap(), (0, false));
-    assert_eq!(store.used_bytes(), 0);
+    assert_eq!(store.used_bytes().await.unwrap(), 0);
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -237,17 +247,17 @@ async fn old_objects_are_removed_unless_used_or_checked() {
     let removed = store.remove_unused(SystemTime::now() + DAY, kept).await.unwrap();
     assert_eq!((removed.blobs, removed.uploads), (2, 1));
     assert_eq!(store.committed(&BlobRef::of(&half)).await.unwrap(), (0, false), "it restarts");
-    assert_eq!(store.used_bytes(), 4);
+    assert_eq!(store.used_bytes().await.unwrap(), 4);
 }
 
 #[tokio::test]
 async fn tenants_are_apart_and_found_again() {
     let (server, dir) = (S3Server::start(), tempfile::tempdir().unwrap());
     let [reef, wreck] = ["reef", "wreck"].map(|name| name.parse::<Tenant>().unwrap());
-    let blobs = TenantBlobs::open(at(&server), dir.path(), 0, Clock::start()).await.unwrap();
+    let blobs = TenantBlobs::open(at(&server), dir.path(), 0, Clock::start(), None).await.unwrap();
     let blob = blobs.of(&reef).await.unwrap().put(Bytes::from_static(b"a photograph")).await.unwrap();
     assert!(!blobs.of(&wreck).await.unwrap().contains(&blob).await.unwrap());
-    let blobs = TenantBlobs::open(at(&server), dir.path(), 0, Clock::start()).await.unwrap();
+    let blobs = TenantBlobs::open(at(&server), dir.path(), 0, Clock::start(), None).await.unwrap();
     let all = blobs.all().await.unwrap();
     let names: Vec<String> = all.iter().map(|(tenant, _)| tenant.to_string()).collect();
     assert_eq!(names, ["default", "reef"]);
@@ -306,7 +316,7 @@ async fn an_outage_of_the_bucket_is_no_failed_attempt() {
     let (server, dir) = (S3Server::start(), tempfile::tempdir().unwrap());
     let once = RetryConfig { max_retries: 0, ..RetryConfig::default() };
     let at = ObjectsAt::Bucket { url: server.url(PREFIX), store: store_of(&server, once) };
-    let blobs = TenantBlobs::open(at, dir.path(), 0, Clock::start()).await.unwrap();
+    let blobs = TenantBlobs::open(at, dir.path(), 0, Clock::start(), None).await.unwrap();
     let store = blobs.of(&Tenant::default()).await.unwrap();
     let blob = store.put(Bytes::from_static(b"a result")).await.unwrap();
     let opened = |store: Arc<BlobStore>, blob: BlobRef| async move {
@@ -375,7 +385,7 @@ async fn a_bucket_that_is_gone_is_no_bucket_without_blobs() {
     let (server, dir) = (S3Server::start(), tempfile::tempdir().unwrap());
     let place = at(&server);
     place.hold_for("one", Path::new("data")).await.unwrap();
-    let blobs = TenantBlobs::open(place, dir.path(), 0, Clock::start()).await.unwrap();
+    let blobs = TenantBlobs::open(place, dir.path(), 0, Clock::start(), None).await.unwrap();
     blobs.answers().await.unwrap();
     std::fs::remove_dir_all(server.folder("")).unwrap();
     assert!(matches!(blobs.answers().await, Err(ObjectError::Unavailable(_))));

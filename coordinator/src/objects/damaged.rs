@@ -15,7 +15,7 @@ impl BlobStore {
     pub async fn set_aside_if_damaged(&self, digest: &str) -> Result<bool, ObjectError> {
         let set_aside = match &self.place {
             Place::Disk(disk) => disk.set_aside_if_damaged(digest).await?,
-            Place::Bucket(bucket) => bucket.set_aside_if_damaged(digest).await?,
+            Place::Bucket(bucket) => bucket.set_aside_if_damaged(digest, self.shared.as_ref()).await?,
         };
         self.count_removed(set_aside.unwrap_or(0));
         Ok(set_aside.is_some())

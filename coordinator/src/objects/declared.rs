@@ -27,15 +27,28 @@ impl Declared {
 
 impl BlobStore {
     /// Bytes of all blobs and uploads.
-    pub fn used_bytes(&self) -> u64 {
+    ///
+    /// # Errors
+    /// When the database that counts them is not available.
+    pub async fn used_bytes(&self) -> Result<u64, ObjectError> {
+        if let Some(shared) = &self.shared {
+            return shared.used_bytes().await;
+        }
         let declared = self.declared.lock().unwrap_or_else(PoisonError::into_inner).total;
-        self.whole_bytes().saturating_add(declared)
+        Ok(self.whole_bytes().saturating_add(declared))
     }
 
-    /// Bytes counted for the upload of a blob.
-    pub fn declared_bytes(&self, digest: &str) -> u64 {
+    /// Bytes counted for the uploads of some blobs together.
+    ///
+    /// # Errors
+    /// As [`BlobStore::used_bytes`].
+    pub async fn declared_bytes(&self, digests: &[&str]) -> Result<u64, ObjectError> {
+        if let Some(shared) = &self.shared {
+            return shared.declared_bytes(digests).await;
+        }
         let declared = self.declared.lock().unwrap_or_else(PoisonError::into_inner);
-        declared.by_digest.get(digest).copied().unwrap_or(0)
+        let counted = digests.iter().filter_map(|digest| declared.by_digest.get(*digest));
+        Ok(counted.fold(0, |sum, bytes| sum.saturating_add(*bytes)))
     }
 
     /// Counts an upload with `bytes`; 0 ends it.

@@ -3,6 +3,8 @@
 use std::io;
 use std::path::PathBuf;
 
+use crate::store::StoreError;
+
 /// Errors of the object store.
 #[derive(Debug, thiserror::Error)]
 pub enum ObjectError {
@@ -85,6 +87,15 @@ pub enum ObjectError {
     /// The bucket does not answer, or refuses.
     #[error("the object store is not available: {0}")]
     Unavailable(object_store::Error),
+    /// The database that counts the blobs failed.
+    #[error(transparent)]
+    Ledger(#[from] StoreError),
+    /// Deletions took too long.
+    #[error("the object store did not delete objects within {seconds} s; the next garbage collection will")]
+    Late {
+        /// The limit.
+        seconds: u64,
+    },
     /// A URL that names no object store.
     #[error("objects = {url:?}: {message}")]
     BadUrl {

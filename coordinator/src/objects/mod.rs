@@ -15,6 +15,7 @@ mod garbage;
 mod place;
 mod reader;
 mod segments;
+mod shared;
 mod tenants;
 mod writer;
 
@@ -38,6 +39,7 @@ use disk::{Disk, spawn_io};
 pub use error::ObjectError;
 pub use garbage::Removed;
 pub use place::ObjectsAt;
+use shared::SharedRows;
 pub use tenants::TenantBlobs;
 pub use writer::BlobWriter;
 
@@ -50,10 +52,12 @@ const CHECKS_AT_ONCE: usize = 32;
 /// The blobs of one tenant.
 pub struct BlobStore {
     place: Place,
+    /// The rows of a bucket's blobs that several coordinators share; they count instead of the fields below.
+    shared: Option<SharedRows>,
     min_free_bytes: u64,
     /// Clock for the age of files.
     clock: Clock,
-    /// Digests that a stream is writing.
+    /// Digests that a stream of this process is writing.
     writing: Mutex<HashSet<String>>,
     /// Bytes of all complete blobs.
     whole_bytes: AtomicU64,
@@ -82,20 +86,26 @@ impl BlobStore {
         Ok(store)
     }
 
-    /// Opens the store in a bucket, which is listed once. Files that become blobs are written to `staging`
-    /// first.
+    /// Opens the store in a bucket. Files that become blobs are written to `staging` first. The bucket is
+    /// listed once: at every start, or for the shared rows of a new database.
     ///
     /// # Errors
-    /// When the bucket cannot be listed, or `staging` cannot be created.
+    /// When the bucket cannot be listed, `staging` cannot be created, or the database is not available.
     async fn open_bucket(
         store: Arc<dyn ObjectStore>,
         staging: PathBuf,
         clock: Clock,
+        shared: Option<SharedRows>,
     ) -> Result<Self, ObjectError> {
-        let bucket = Bucket::open(store, staging, clock)?;
-        let content = bucket.content().await?;
-        let store = Self::over(Place::Bucket(Arc::new(bucket)), 0, clock);
-        store.start_with(content.whole_bytes, content.uploads);
+        let bucket = Arc::new(Bucket::open(store, staging, clock)?);
+        let store = Self { shared, ..Self::over(Place::Bucket(Arc::clone(&bucket)), 0, clock) };
+        match &store.shared {
+            Some(shared) => shared.fill(&bucket).await?,
+            None => {
+                let content = bucket.content().await?;
+                store.start_with(content.whole_bytes, content.uploads);
+            }
+        }
         Ok(store)
     }
 
@@ -116,6 +126,7 @@ impl BlobStore {
     fn over(place: Place, min_free_bytes: u64, clock: Clock) -> Self {
         Self {
             place,
+            shared: None,
             min_free_bytes,
             clock,
             writing: Mutex::default(),
@@ -167,9 +178,12 @@ impl BlobStore {
 
     /// Whether the blob is present and complete. From now on garbage collection spares it for a while.
     pub async fn contains(&self, blob: &BlobRef) -> Result<bool, ObjectError> {
-        let bytes = match &self.place {
-            Place::Disk(disk) => disk.ask(&blob.digest).await?,
-            Place::Bucket(bucket) => bucket.ask(&blob.digest).await?,
+        let bytes = match (&self.place, &self.shared) {
+            (Place::Disk(disk), _) => disk.ask(&blob.digest).await?,
+            (Place::Bucket(bucket), None) => bucket.ask(&blob.digest).await?,
+            (Place::Bucket(bucket), Some(shared)) => {
+                shared.ask(bucket, &[&blob.digest]).await?.pop().flatten()
+            }
         };
         Ok(bytes == Some(blob.bytes))
     }
@@ -184,6 +198,13 @@ impl BlobStore {
                     missing.push(index);
                 }
             }
+            return Ok(missing);
+        }
+        if let (Place::Bucket(bucket), Some(shared)) = (&self.place, &self.shared) {
+            let digests: Vec<&str> = blobs.iter().map(|blob| blob.digest.as_str()).collect();
+            let lengths = shared.ask(bucket, &digests).await?.into_iter().zip(blobs);
+            let is_there = lengths.map(|(bytes, blob)| bytes == Some(blob.bytes));
+            missing.extend(is_there.enumerate().filter(|(_, is_there)| !is_there).map(|(index, _)| index));
             return Ok(missing);
         }
         let checks = futures::stream::iter(0..blobs.len()).map(|index| async move {
@@ -206,7 +227,7 @@ impl BlobStore {
     pub async fn size(&self, digest: &str) -> Result<u64, ObjectError> {
         match threads::by_library(self.objects().head(&object_path(digest)?)).await {
             Ok(meta) => Ok(meta.size),
-            Err(object_store::Error::NotFound { .. }) => Err(ObjectError::NotFound(digest.to_owned())),
+            Err(object_store::Error::NotFound { .. }) => Err(self.not_found(digest).await),
             Err(error) => Err(self.failed(error)),
         }
     }
@@ -255,9 +276,20 @@ impl BlobStore {
             Ok(bytes) if bytes.len() as u64 == wanted => Ok(bytes),
             // It has become shorter.
             Ok(_) => Err(ObjectError::Damaged(digest.to_owned())),
-            Err(object_store::Error::NotFound { .. }) => Err(ObjectError::NotFound(digest.to_owned())),
+            Err(object_store::Error::NotFound { .. }) => Err(self.not_found(digest).await),
             Err(error) => Err(self.failed(error)),
         }
+    }
+
+    /// The error of a blob whose object does not exist. A shared row that says otherwise is removed, so that
+    /// the next one that asks sends the blob again.
+    async fn not_found(&self, digest: &str) -> ObjectError {
+        if let (Place::Bucket(bucket), Some(shared)) = (&self.place, &self.shared)
+            && let Err(error) = shared.withdraw_lost(bucket, digest).await
+        {
+            tracing::warn!(%error, digest, "cannot look for a blob whose object is gone");
+        }
+        ObjectError::NotFound(digest.to_owned())
     }
 
     /// A whole blob, checked against its digest; at most 4 GiB of it.
@@ -278,7 +310,10 @@ impl BlobStore {
                 let path = object_path(&blob.digest)?;
                 threads::by_library(async { disk.store().get(&path).await?.bytes().await }).await?
             }
-            Place::Bucket(bucket) => bucket.read(&blob.digest, blob.bytes).await?,
+            Place::Bucket(bucket) => match bucket.read(&blob.digest, blob.bytes).await {
+                Err(ObjectError::NotFound(_)) => return Err(self.not_found(&blob.digest).await),
+                read => read?,
+            },
         };
         if blake3::hash(&bytes).to_hex().as_str() == blob.digest {
             return Ok(bytes);
@@ -296,7 +331,7 @@ impl BlobStore {
                 Place::Disk(disk) => disk.put(&blob.digest, bytes).await?,
                 Place::Bucket(bucket) => bucket.put(&blob.digest, bytes).await?,
             }
-            self.whole_bytes.fetch_add(blob.bytes, Ordering::Relaxed);
+            self.count_whole(&blob).await?;
         }
         Ok(blob)
     }
@@ -324,9 +359,18 @@ impl BlobStore {
             Place::Bucket(bucket) => bucket.adopt(&file, &blob.digest).await?,
         }
         if is_new {
-            self.whole_bytes.fetch_add(blob.bytes, Ordering::Relaxed);
+            self.count_whole(&blob).await?;
         }
         Ok(blob)
+    }
+
+    /// Counts a complete blob, which others see from now on.
+    async fn count_whole(&self, blob: &BlobRef) -> Result<(), ObjectError> {
+        match &self.shared {
+            Some(shared) => shared.publish(blob).await?,
+            None => drop(self.whole_bytes.fetch_add(blob.bytes, Ordering::Relaxed)),
+        }
+        Ok(())
     }
 
     /// Opens the upload of a blob at `offset`, which must equal the received bytes; `None` if the blob is
@@ -355,7 +399,10 @@ impl BlobStore {
             });
         }
         self.check_space(blob.bytes.saturating_sub(offset)).await?;
-        self.declare_within(&blob.digest, blob.bytes, limit_bytes)?;
+        match &self.shared {
+            Some(shared) => shared.reserve(blob, limit_bytes).await?,
+            None => self.declare_within(&blob.digest, blob.bytes, limit_bytes)?,
+        }
         claim.count(offset);
         BlobWriter::open(claim, blob.clone(), offset).await.map(Some)
     }
@@ -384,6 +431,10 @@ impl BlobStore {
                 spawn_io(&root, move || garbage::remove_unused(&store, &disk, before, &used)).await
             }
             Place::Bucket(bucket) => {
+                if let Some(shared) = &self.shared {
+                    let is_written = |digest: &str| self.is_written(digest);
+                    return shared.remove_unused(bucket, before, &used, is_written).await;
+                }
                 let gone = |gone: bucket::Gone<'_>| match gone {
                     bucket::Gone::Blob { bytes } => self.count_removed(bytes),
                     bucket::Gone::Damaged { .. } => {}
@@ -443,12 +494,33 @@ impl WriteClaim {
     fn count(&self, arrived_bytes: u64) {
         *self.arrived_bytes.lock().unwrap_or_else(PoisonError::into_inner) = Some(arrived_bytes);
     }
+
+    /// The upload is complete: its blob counts.
+    async fn complete(&self, bytes: u64) -> Result<(), ObjectError> {
+        self.store.count_whole(&BlobRef { digest: self.digest.clone(), bytes }).await?;
+        // A shared row of the upload has ended with the blob's.
+        let ended = self.store.shared.is_none().then_some(0);
+        *self.arrived_bytes.lock().unwrap_or_else(PoisonError::into_inner) = ended;
+        Ok(())
+    }
+
+    /// Counts what has arrived in the shared rows, before another coordinator goes on.
+    async fn settle(&self) {
+        let Some(shared) = &self.store.shared else { return };
+        let arrived = self.arrived_bytes.lock().unwrap_or_else(PoisonError::into_inner).take();
+        let Some(bytes) = arrived else { return };
+        if let Err(error) = shared.leave(&self.digest, bytes).await {
+            let digest = &self.digest;
+            tracing::warn!(%error, digest, "an upload counts too much until the next garbage collection");
+        }
+    }
 }
 
 impl Drop for WriteClaim {
     fn drop(&mut self) {
-        // Before another stream may write it.
-        if let Some(bytes) = *self.arrived_bytes.get_mut().unwrap_or_else(PoisonError::into_inner) {
+        // Before another stream may write it. The rows were settled by the upload's task.
+        let arrived = *self.arrived_bytes.get_mut().unwrap_or_else(PoisonError::into_inner);
+        if let Some(bytes) = arrived.filter(|_| self.store.shared.is_none()) {
             self.store.declare(&self.digest, bytes);
         }
         self.store.writing.lock().unwrap_or_else(PoisonError::into_inner).remove(&self.digest);
@@ -480,5 +552,7 @@ mod bucket_tests;
 #[cfg(test)]
 #[path = "../../../tests/support/s3.rs"]
 pub(crate) mod s3_server;
+#[cfg(test)]
+mod shared_tests;
 #[cfg(test)]
 mod tests;

@@ -30,24 +30,40 @@ struct Segment {
 
 /// The segments of an upload from byte 0 on, without a gap.
 async fn arrived(bucket: &Bucket, digest: &str) -> Result<Vec<Segment>, ObjectError> {
-    // Of two that begin at one byte, the longer one.
-    let mut by_offset = BTreeMap::<u64, Segment>::new();
+    let mut by_offset = BTreeMap::<u64, Vec<Segment>>::new();
     let mut listed = bucket.list(&format!("uploads/{digest}"));
     while let Some(meta) = listed.try_next().await? {
         let offset = meta.location.filename().and_then(|name| name.split_once('-')?.0.parse().ok());
-        let Some(offset) = offset else { continue };
-        let found = Segment { path: meta.location, bytes: meta.size };
-        let segment = by_offset.entry(offset).or_insert_with(|| found.clone());
-        if segment.bytes < found.bytes {
-            *segment = found;
+        if let Some(offset) = offset
+            && meta.size > 0
+        {
+            by_offset.entry(offset).or_default().push(Segment { path: meta.location, bytes: meta.size });
+        }
+    }
+    Ok(longest_run(by_offset))
+}
+
+/// The segments that reach furthest from byte 0 on. Two streams of one upload, at two coordinators, leave
+/// segments that overlap.
+fn longest_run(by_offset: BTreeMap<u64, Vec<Segment>>) -> Vec<Segment> {
+    // From the last offset on: where each run ends, with its first segment.
+    let mut runs = BTreeMap::<u64, (u64, Segment)>::new();
+    for (offset, segments) in by_offset.into_iter().rev() {
+        let reach = |segment: &Segment| {
+            let end = offset + segment.bytes;
+            runs.get(&end).map_or(end, |(reach, _)| *reach)
+        };
+        let furthest = segments.into_iter().map(|segment| (reach(&segment), segment));
+        if let Some(best) = furthest.max_by_key(|(reach, _)| *reach) {
+            runs.insert(offset, best);
         }
     }
     let (mut run, mut end) = (Vec::new(), 0);
-    while let Some(segment) = by_offset.remove(&end).filter(|segment| segment.bytes > 0) {
+    while let Some((_, segment)) = runs.remove(&end) {
         end += segment.bytes;
         run.push(segment);
     }
-    Ok(run)
+    run
 }
 
 /// Received bytes of an upload.
@@ -157,6 +173,7 @@ impl Upload {
                 Request::Discard => self.discard().await,
             };
             if is_last || done.is_err() {
+                self.claim.settle().await;
                 drop(self);
                 // The caller may be gone.
                 let _ = answer.send(done);
@@ -167,6 +184,7 @@ impl Upload {
         if let Err(error) = self.save().await {
             tracing::warn!(%error, digest = self.claim.digest, "the end of an interrupted upload is lost");
         }
+        self.claim.settle().await;
     }
 
     fn durable_bytes(&self) -> u64 {
@@ -231,11 +249,14 @@ impl Upload {
     async fn publish(&mut self) -> Result<(), ObjectError> {
         if self.complete.is_empty() && self.current.is_none() {
             let whole: Vec<u8> = self.waiting.take().concat();
-            return self.bucket.put(&self.claim.digest, whole.into()).await;
+            self.bucket.put(&self.claim.digest, whole.into()).await?;
+            return self.claim.complete(self.bytes).await;
         }
         self.save().await?;
         let paths: Vec<ObjectPath> = self.complete.drain(..).map(|segment| segment.path).collect();
         self.bucket.publish(&self.claim.digest, self.bytes, &paths).await?;
+        // Before the segments go: after a crash here, the client need not send it again.
+        self.claim.complete(self.bytes).await?;
         // Garbage collection finds what stays here.
         if let Err(error) = self.bucket.delete(paths, |_| ()).await {
             let digest = &self.claim.digest;
@@ -251,6 +272,8 @@ impl Upload {
         }
         self.complete.clear();
         let paths = arrived(&self.bucket, &self.claim.digest).await?;
-        self.bucket.delete(paths.into_iter().map(|segment| segment.path).collect(), |_| ()).await
+        self.bucket.delete(paths.into_iter().map(|segment| segment.path).collect(), |_| ()).await?;
+        self.claim.count(0);
+        Ok(())
     }
 }

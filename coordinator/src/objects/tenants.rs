@@ -9,9 +9,10 @@ use object_store::path::Path as ObjectPath;
 use object_store::prefix::PrefixStore;
 use tokio::sync::OnceCell;
 
-use super::{BlobStore, ObjectError, ObjectsAt, check_disk, free_bytes, io_error};
+use super::{BlobStore, ObjectError, ObjectsAt, SharedRows, check_disk, free_bytes, io_error};
 use crate::clock::Clock;
 use crate::schedule::Tenant;
+use crate::store::ledger::Ledger;
 
 /// A store for each tenant, in a folder or under a prefix of its own. No tenant can learn which blobs another
 /// has, neither by checking for a blob nor by naming its digest.
@@ -20,12 +21,14 @@ pub struct TenantBlobs {
     data_dir: PathBuf,
     min_free_bytes: u64,
     clock: Clock,
+    /// Counts the blobs of a bucket, if several coordinators may have it.
+    ledger: Option<Arc<dyn Ledger>>,
     open: Mutex<HashMap<Tenant, Arc<OnceCell<Arc<BlobStore>>>>>,
 }
 
 impl TenantBlobs {
     /// The stores at a place. Writes to the local disk are refused when less than `min_free_bytes` is free;
-    /// `clock` determines the age of files.
+    /// `clock` determines the age of files. `ledger` counts the blobs of a bucket for several coordinators.
     ///
     /// # Errors
     /// When a folder cannot be read or created, or a bucket is not available.
@@ -34,9 +37,10 @@ impl TenantBlobs {
         data_dir: &Path,
         min_free_bytes: u64,
         clock: Clock,
+        ledger: Option<Arc<dyn Ledger>>,
     ) -> Result<Self, ObjectError> {
         let data_dir = data_dir.to_owned();
-        let blobs = Self { at, data_dir, min_free_bytes, clock, open: Mutex::default() };
+        let blobs = Self { at, data_dir, min_free_bytes, clock, ledger, open: Mutex::default() };
         blobs.of(&Tenant::default()).await?;
         Ok(blobs)
     }
@@ -80,7 +84,9 @@ impl TenantBlobs {
             }
             ObjectsAt::Bucket { store, .. } => {
                 let staging = Self::folder(&self.data_dir, tenant).join("staging");
-                BlobStore::open_bucket(of_tenant(store, tenant), staging, self.clock).await?
+                let shared =
+                    self.ledger.as_ref().map(|ledger| SharedRows::new(Arc::clone(ledger), tenant.clone()));
+                BlobStore::open_bucket(of_tenant(store, tenant), staging, self.clock, shared).await?
             }
         };
         Ok(Arc::new(store))
@@ -93,7 +99,7 @@ impl TenantBlobs {
     pub async fn used_bytes(&self, tenant: &Tenant) -> Result<u64, ObjectError> {
         match &self.at {
             ObjectsAt::Folder(root) if !Self::folder(root, tenant).is_dir() => Ok(0),
-            _ => Ok(self.of(tenant).await?.used_bytes()),
+            _ => self.of(tenant).await?.used_bytes().await,
         }
     }
 
@@ -187,7 +193,7 @@ mod tests {
 
     async fn open(data_dir: &Path) -> TenantBlobs {
         let at = ObjectsAt::Folder(data_dir.to_owned());
-        TenantBlobs::open(at, data_dir, 0, Clock::start()).await.unwrap()
+        TenantBlobs::open(at, data_dir, 0, Clock::start(), None).await.unwrap()
     }
 
     #[tokio::test]

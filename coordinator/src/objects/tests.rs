@@ -255,24 +255,30 @@ async fn uploads_count_declared_bytes_then_received_bytes() {
     let other = blob_of(&[8; 600]);
     let mut upload = store.begin_write(&blob, 0, Some(1500)).await.unwrap().unwrap();
     upload.append(0, Bytes::from(vec![7; 300])).await.unwrap();
-    assert_eq!(store.used_bytes(), 1000);
+    assert_eq!(store.used_bytes().await.unwrap(), 1000);
     let too_much = store.begin_write(&other, 0, Some(1500)).await.err().unwrap();
     assert!(matches!(too_much, ObjectError::OverLimit { used_bytes: 1000, limit_bytes: 1500 }), "{too_much}");
     // As when its client disconnects silently.
     drop(upload);
-    assert_eq!((store.used_bytes(), store.declared_bytes(&blob.digest)), (300, 300));
+    assert_eq!(
+        (store.used_bytes().await.unwrap(), store.declared_bytes(&[&blob.digest]).await.unwrap()),
+        (300, 300)
+    );
     drop(store);
 
     let store = std::sync::Arc::new(BlobStore::open(dir.path(), 0, Clock::start()).unwrap());
-    assert_eq!(store.used_bytes(), 300, "the next process forgets the received bytes");
+    assert_eq!(store.used_bytes().await.unwrap(), 300, "the next process forgets the received bytes");
     let mut upload =
         store.begin_write(&blob, 300, Some(1000)).await.unwrap().expect("its own part counts once");
     upload.append(300, Bytes::from(vec![7; 700])).await.unwrap();
     upload.finish().await.unwrap();
-    assert_eq!((store.used_bytes(), store.declared_bytes(&blob.digest)), (1000, 0));
+    assert_eq!(
+        (store.used_bytes().await.unwrap(), store.declared_bytes(&[&blob.digest]).await.unwrap()),
+        (1000, 0)
+    );
 
     let mut upload = store.begin_write(&other, 0, None).await.unwrap().unwrap();
     upload.append(0, Bytes::from(vec![9; 600])).await.unwrap();
     assert!(upload.finish().await.is_err());
-    assert_eq!(store.used_bytes(), 1000, "deleted bytes count");
+    assert_eq!(store.used_bytes().await.unwrap(), 1000, "deleted bytes count");
 }

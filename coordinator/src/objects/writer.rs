@@ -1,7 +1,6 @@
 //! One upload in progress.
 
 use std::sync::Arc;
-use std::sync::atomic::Ordering;
 
 use bytes::Bytes;
 use fathom_core::scene::BlobRef;
@@ -112,11 +111,10 @@ impl BlobWriter {
                     return Err(self.discard(message).await);
                 }
                 file.publish().await?;
+                self.claim.complete(self.blob.bytes).await?;
             }
             Body::Segments(segments) => segments.publish().await?,
         }
-        self.claim.store.whole_bytes.fetch_add(self.blob.bytes, Ordering::Relaxed);
-        self.claim.count(0);
         Ok(())
     }
 
@@ -127,7 +125,9 @@ impl BlobWriter {
         };
         match discarded {
             Ok(()) => {
-                self.claim.count(0);
+                if let Body::File(_) = self.body {
+                    self.claim.count(0);
+                }
                 ObjectError::DigestMismatch { digest: self.blob.digest.clone(), message }
             }
             Err(error) => error,

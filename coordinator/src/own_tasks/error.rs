@@ -6,6 +6,7 @@ use fathom_merge::MergeError;
 
 use crate::objects::ObjectError;
 use crate::schedule::{FailClass, TaskId};
+use crate::store::StoreError;
 
 /// Why one of the coordinator's own tasks failed.
 #[derive(Debug, thiserror::Error)]
@@ -47,7 +48,7 @@ impl OwnTaskError {
     /// The error of a file, which may be a blob in a bucket.
     pub fn of_io(error: &io::Error) -> Self {
         let of_bucket = error.get_ref().and_then(|error| error.downcast_ref::<ObjectError>());
-        let is_outage = matches!(of_bucket, Some(ObjectError::Unavailable(_)));
+        let is_outage = of_bucket.is_some_and(is_outage);
         Self { is_outage, ..Self::failed(error.to_string()) }
     }
 
@@ -57,13 +58,23 @@ impl OwnTaskError {
     }
 }
 
+/// Whether the bucket, or the database that counts its blobs, is not available.
+fn is_outage(error: &ObjectError) -> bool {
+    matches!(
+        error,
+        ObjectError::Unavailable(_)
+            | ObjectError::Late { .. }
+            | ObjectError::Ledger(StoreError::Unavailable(_))
+    )
+}
+
 impl From<ObjectError> for OwnTaskError {
     fn from(error: ObjectError) -> Self {
         match error {
             ObjectError::NotFound(_) | ObjectError::BadDigest(_) | ObjectError::TooLarge { .. } => {
                 Self::input(error.to_string())
             }
-            ObjectError::Unavailable(_) => {
+            error if is_outage(&error) => {
                 Self { is_outage: true, ..Self::new(FailClass::Environment, error.to_string()) }
             }
             _ => Self::new(FailClass::Environment, error.to_string()),

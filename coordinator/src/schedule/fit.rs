@@ -7,7 +7,7 @@ use super::task::TaskRecord;
 use super::{Stage, TaskId, Tenant};
 
 /// A worker, as the assignment of tasks sees it.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct WorkerProfile {
     /// Its display name.
     pub name: String,

@@ -137,11 +137,18 @@ pub fn step(rows: &mut JobRows, event: Event, now_ms: u64, rules: &Rules) -> Res
         }
         Event::Expire { lease, why } => {
             held(rows, &lease, rules)?;
-            let message = match why {
-                Expired::Silent => "lease expired: its worker stopped renewing",
-                Expired::Stalled => "lease expired: its worker is alive but makes no progress",
+            let (class, message) = match why {
+                // As at a restart: stopping a coordinator is no failed attempt.
+                _ if lease.task.stage.is_own() => (None, "its coordinator is gone"),
+                Expired::Silent => {
+                    (Some(FailClass::Environment), "lease expired: its worker stopped renewing")
+                }
+                Expired::Stalled => {
+                    let message = "lease expired: its worker is alive but makes no progress";
+                    (Some(FailClass::Environment), message)
+                }
             };
-            give_back(rows, &lease, Some(FailClass::Environment), message, now_ms, rules, &mut events);
+            give_back(rows, &lease, class, message, now_ms, rules, &mut events);
         }
         Event::Release { lease, reason } => {
             if was_returned(rows, &lease) {

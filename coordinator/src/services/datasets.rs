@@ -61,10 +61,13 @@ pub async fn begin(
     // The received parts of missing blobs count already.
     let (mut missing_bytes, mut counted_bytes) = (0_u64, 0_u64);
     for some in chunks(list.value.blobs().map(|file| file.blob())) {
-        for blob in objects.missing(&some).await?.into_iter().map(|index| &some[index]) {
+        let absent: Vec<&BlobRef> =
+            objects.missing(&some).await?.into_iter().map(|index| &some[index]).collect();
+        let digests: Vec<&str> = absent.iter().map(|blob| blob.digest.as_str()).collect();
+        counted_bytes = counted_bytes.saturating_add(objects.declared_bytes(&digests).await?);
+        for blob in absent {
             missing_count += 1;
             missing_bytes = missing_bytes.saturating_add(blob.bytes);
-            counted_bytes = counted_bytes.saturating_add(objects.declared_bytes(&blob.digest));
             if missing.len() < MAX_BLOBS {
                 missing.push(encode::blob(blob));
             }

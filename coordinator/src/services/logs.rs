@@ -4,8 +4,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use fathom_observe::capture::{LoggedLine, tidy};
-use fathom_observe::queue::{BATCH, Queue};
-use fathom_observe::threads;
+use fathom_observe::queue::{BATCH, Batch, Queue};
 use fathom_proto::{v1, worker::v1 as worker_v1};
 use futures::StreamExt;
 use futures::stream::BoxStream;
@@ -16,8 +15,7 @@ use tracing::Level;
 
 use super::encode;
 use crate::access::{Principal, Refused};
-use crate::logs::{JobLogs, KeptLine, NewLine, Position, Severity, Wanted};
-use crate::objects::ObjectError;
+use crate::logs::{KeptLine, LogError, Logs, NewLine, Page, Position, Severity, Wanted};
 use crate::schedule::{JobId, Lease, Refusal, TaskId};
 use crate::service_error::ServiceError;
 use crate::state::{State, stopped};
@@ -32,6 +30,8 @@ const PAGE: usize = 256;
 /// Shortest and longest interval between reads of a follower.
 const LOOK_EVERY: Duration = Duration::from_millis(200);
 const LOOK_AT_LEAST_EVERY: Duration = Duration::from_secs(1);
+/// Pause after which the coordinator's own lines are sent again when the database was away.
+const AGAIN_AFTER: Duration = Duration::from_secs(1);
 /// Worker name in lines of the coordinator.
 const COORDINATOR: &str = "coordinator";
 
@@ -58,9 +58,12 @@ pub async fn append(
         message: tidy(&line.message),
     };
     let lines: Vec<NewLine> = request.lines.into_iter().map(line).collect();
-    let bytes = lines.iter().map(|line| line.message.len() as u64).sum();
-    shared.objects.check_space(bytes).await?;
-    write(&shared.logs, lease, worker, lines, shared.clock.now_ms()).await
+    if shared.logs.is_on_disk() {
+        let bytes = lines.iter().map(|line| line.message.len() as u64).sum();
+        shared.objects.check_space(bytes).await?;
+    }
+    let (attempt, holder) = ((lease.task, lease.attempt), (worker.as_str(), lease.fence));
+    Ok(shared.logs.append(&lease.job, attempt, holder, lines, shared.clock.now_ms()).await?)
 }
 
 /// The holder of a lease whose lines are still accepted: a task's latest attempt, or an earlier one whose
@@ -79,26 +82,11 @@ async fn holder(shared: &State, lease: &Lease) -> Result<String, ServiceError> {
     if is_latest && task.running().next().is_none() {
         return Ok(task.worker);
     }
-    shared.logs.holder(&lease.job, (lease.task, lease.attempt), lease.fence).ok_or_else(|| {
+    let earlier = shared.logs.holder(&lease.job, (lease.task, lease.attempt), lease.fence).await?;
+    earlier.ok_or_else(|| {
         let (task, given, latest) = (lease.task, lease.fence, task.fence);
         StoreError::Refused(Refusal::StaleFence { task, given, latest }).into()
     })
-}
-
-async fn write(
-    logs: &Arc<JobLogs>,
-    lease: Lease,
-    worker: String,
-    lines: Vec<NewLine>,
-    now_ms: u64,
-) -> Result<(), ServiceError> {
-    let (logs, path) = (Arc::clone(logs), logs.folder(&lease.job));
-    let append = move || {
-        let holder = (worker.as_str(), lease.fence);
-        logs.append(&lease.job, (lease.task, lease.attempt), holder, lines, now_ms)
-    };
-    let written = threads::blocking(append).await.unwrap_or_else(|e| Err(std::io::Error::other(e)));
-    written.map_err(|source| ObjectError::Io { action: "write the log", path, source }.into())
 }
 
 /// Writes a line about an attempt to its log.
@@ -109,22 +97,26 @@ pub fn note(shared: &State, lease: &Lease, level: Level, message: &str) {
 /// Stores the lines of the coordinator's own tasks until it stops.
 pub async fn keep_own_lines(
     lines: Arc<Queue<Lease>>,
-    logs: Arc<JobLogs>,
+    logs: Arc<dyn Logs>,
     mut stopping: watch::Receiver<bool>,
 ) {
+    let mut stops = stopping.clone();
     let keep = async {
         loop {
             let batch = lines.next().await;
-            let new = batch.lines.iter().map(|(_, line)| NewLine {
-                from_worker: None,
-                time_ms: line.time_ms,
-                severity: severity_of(line.level),
-                message: line.message.clone(),
-            });
-            let now_ms = batch.lines.last().map_or(0, |(_, line)| line.time_ms);
-            let lease = batch.of.as_ref().clone();
-            if let Err(error) = write(&logs, lease, COORDINATOR.into(), new.collect(), now_ms).await {
+            while let Err(error) = keep_batch(logs.as_ref(), &batch).await {
+                let is_away = matches!(error, LogError::Store(StoreError::Unavailable(_)));
+                if is_away && !*stops.borrow() {
+                    // The database may come back. Without numbers of a worker, lines whose answer was lost
+                    // are stored twice.
+                    tokio::select! {
+                        () = tokio::time::sleep(AGAIN_AFTER) => {}
+                        () = stopped(&mut stops) => {}
+                    }
+                    continue;
+                }
                 tracing::warn!(%error, lines = batch.lines.len(), "lost lines of a job's log");
+                break;
             }
             lines.remove(&batch);
         }
@@ -140,11 +132,21 @@ pub async fn keep_own_lines(
     }
 }
 
+async fn keep_batch(logs: &dyn Logs, batch: &Batch<Lease>) -> Result<(), LogError> {
+    let new = batch.lines.iter().map(|(_, line)| NewLine {
+        from_worker: None,
+        time_ms: line.time_ms,
+        severity: severity_of(line.level),
+        message: line.message.clone(),
+    });
+    let now_ms = batch.lines.last().map_or(0, |(_, line)| line.time_ms);
+    let (lease, holder) = (&batch.of, (COORDINATOR, batch.of.fence));
+    logs.append(&lease.job, (lease.task, lease.attempt), holder, new.collect(), now_ms).await
+}
+
 /// Removes the log of a deleted job. The next garbage collection removes the rest after a failure.
 pub async fn forget(shared: &State, job: &JobId) {
-    let (logs, id) = (Arc::clone(&shared.logs), job.clone());
-    let removed = threads::blocking(move || logs.remove(&id)).await;
-    if let Err(error) = removed.unwrap_or_else(|e| Err(std::io::Error::other(e))) {
+    if let Err(error) = shared.logs.remove(job).await {
         tracing::warn!(%job, %error, "could not remove the log of a job");
     }
 }
@@ -201,7 +203,8 @@ impl Reader {
             let mut more = true;
             while more {
                 let lines;
-                (lines, position, more) = self.page(position).await?;
+                Page { lines, position, more } =
+                    self.shared.logs.read(&self.job, &self.wanted, position, PAGE).await?;
                 for line in lines {
                     if self.sender.send(Ok(entry(line))).await.is_err() {
                         return Ok(());
@@ -223,17 +226,6 @@ impl Reader {
                 () = tokio::time::sleep(LOOK_AT_LEAST_EVERY) => {}
             }
         }
-    }
-
-    async fn page(&self, mut position: Position) -> Result<(Vec<KeptLine>, Position, bool), ServiceError> {
-        let (logs, job, wanted) = (Arc::clone(&self.shared.logs), self.job.clone(), self.wanted.clone());
-        let read = threads::blocking(move || {
-            let (lines, more) = logs.read(&job, &wanted, &mut position, PAGE)?;
-            Ok((lines, position, more))
-        });
-        let read = read.await.unwrap_or_else(|e| Err(std::io::Error::other(e)));
-        let path = self.shared.logs.folder(&self.job);
-        read.map_err(|source| ObjectError::Io { action: "read the log", path, source }.into())
     }
 }
 

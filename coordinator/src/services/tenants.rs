@@ -8,6 +8,7 @@ use super::{Admin, encode};
 use crate::access::{Principal, Role, TokenRecord};
 use crate::schedule::{Quota, Tenant, Usage};
 use crate::service_error::ServiceError;
+use crate::store::Revoked;
 
 impl Admin {
     /// All tenants with a job, a quota or a token, by name.
@@ -90,20 +91,11 @@ impl Admin {
         let v1::RevokeTokenRequest { token_id: id, even_last } = request;
         // Two revocations at once could each count on the other's token.
         let _alone = self.0.revoking.lock().await;
-        let all = self.0.store.tokens().await?;
-        let now_ms = self.0.clock.now_ms();
-        let opens = |token: &&TokenRecord| token.makes_tokens() && token.holds_at(now_ms);
-        if !even_last
-            && all.iter().any(|token| token.id == id && opens(&token))
-            && all.iter().filter(opens).count() == 1
-        {
-            return Err(ServiceError::LastOperator(id));
-        }
-        let known = all.into_iter().find(|token| token.id == id);
-        let mut record = known.ok_or_else(|| ServiceError::NoSuchToken(id.chars().take(40).collect()))?;
-        // A repeated call does not move the time.
-        record.revoked_ms = record.revoked_ms.or(Some(now_ms));
-        self.0.store.put_token(&record).await?;
+        let record = match self.0.store.revoke_token(&id, self.0.clock.now_ms(), even_last).await? {
+            Revoked::Token(record) => record,
+            Revoked::Last => return Err(ServiceError::LastOperator(id)),
+            Revoked::Unknown => return Err(ServiceError::NoSuchToken(id.chars().take(40).collect())),
+        };
         self.0.access.note(record.clone());
         tracing::info!(token_id = %record.id, name = %record.name, by = %caller.name, "token revoked");
         Ok(token(&record))

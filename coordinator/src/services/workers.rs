@@ -18,7 +18,7 @@ use crate::objects::BlobStore;
 use crate::schedule::{FailClass, Lease, Renewed, TaskOutput, WorkerProfile};
 use crate::service_error::ServiceError;
 use crate::state::{State, stopped};
-use crate::store::{Claim, Grant};
+use crate::store::{Claim, Grant, StoreError};
 use crate::worker_registry::KnownWorker;
 
 /// Longest time that a claim waits.
@@ -87,6 +87,15 @@ impl Workers {
             owner: caller.clone(),
         };
         let (name, adapter) = (worker.profile.name.clone(), worker.adapter.clone());
+        if let Some(members) = self.0.store.members() {
+            // Another coordinator may know it, and its owner.
+            let owner = caller.token_id.as_deref().unwrap_or_default();
+            let row = serde_json::to_vec(&worker)
+                .map_err(|error| StoreError::Unwritable { tree: "workers", message: error.to_string() })?;
+            if !members.register(&incarnation, owner, &row).await? {
+                return Err(ServiceError::OtherWorker);
+            }
+        }
         self.0.workers.add(incarnation, worker)?;
         tracing::info!(worker = %name, %adapter, held = held.len(), "worker registered");
 
@@ -262,9 +271,15 @@ pub async fn release_disowned(shared: Arc<State>) {
             () = tokio::time::sleep(LOOK_EVERY) => {}
         }
         let now = tokio::time::Instant::now();
-        disowned.extend(
-            shared.workers.take_disowned(&shared.access).into_iter().map(|incarnation| (incarnation, now)),
-        );
+        let gone = shared.workers.take_disowned(&shared.access);
+        if let Some(members) = shared.store.members()
+            && !gone.is_empty()
+            && let Err(error) = members.forget(&gone).await
+        {
+            // The next look finds them again.
+            tracing::debug!(%error, "cannot forget workers with revoked tokens");
+        }
+        disowned.extend(gone.into_iter().map(|incarnation| (incarnation, now)));
         // For a while: a claim may have been answered just when the token ended.
         disowned.retain(|_, since| now - *since < DISOWNED_FOR);
         if disowned.is_empty() {

@@ -102,7 +102,10 @@ pub enum StoreError {
         path: String,
     },
     /// Another coordinator uses the database.
-    #[error("the database is in use by another coordinator; stop that one first, or pass another database")]
+    #[error(
+        "the database is in use by another coordinator; stop that one first, or keep the files of both in one bucket \
+         (--objects)"
+    )]
     DatabaseInUse,
     /// No room for the copy of a store that is opened read-only.
     #[error(

@@ -7,10 +7,12 @@
 //! model, which simulations also use.
 
 #[cfg(test)]
-mod conformance;
+pub(crate) mod conformance;
 mod error;
 pub mod export;
 mod flusher;
+pub mod ledger;
+pub mod members;
 pub(crate) mod memory;
 mod postgres;
 pub(crate) mod record;
@@ -26,12 +28,15 @@ use tonic::async_trait;
 
 pub use self::error::StoreError;
 use self::export::Export;
+use self::ledger::Ledger;
+use self::members::Members;
 pub use self::memory::MemoryStore;
-pub use self::postgres::{PostgresOptions, PostgresStore};
+pub use self::postgres::{Hold, PostgresOptions, PostgresStore};
 pub(crate) use self::sled::sync_folder;
 pub use self::sled::{SledOptions, SledStore};
 use crate::access::TokenRecord;
 use crate::datasets::{DatasetId, DatasetRecord, MAX_DATASETS, NewDataset};
+use crate::logs::Logs;
 use crate::schedule::{
     Attempt, Event, EventBody, Expired, FailClass, JobId, JobRecord, JobShape, JobState, Lease, LiveProgress,
     Outcome, Quota, Renewed, Stage, TaskId, TaskOutput, TaskRecord, TaskState, Tenant, Usage, WorkerProfile,
@@ -40,6 +45,31 @@ pub use crate::schedule::{OpenWork, ReadyTask};
 
 /// Version of this program.
 const PROGRAM: &str = env!("CARGO_PKG_VERSION");
+
+/// The outcome of a revocation.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Revoked {
+    /// The token, which is no longer valid.
+    Token(TokenRecord),
+    /// It is the last one that can issue others, and stays valid.
+    Last,
+    /// There is no such token.
+    Unknown,
+}
+
+impl Revoked {
+    /// The outcome for the token `id`, which has not been written yet.
+    fn of(all: Vec<TokenRecord>, id: &str, now_ms: u64, even_last: bool) -> Self {
+        let opens = |token: &&TokenRecord| token.makes_tokens() && token.holds_at(now_ms);
+        let is_last = all.iter().filter(opens).all(|token| token.id == id);
+        let Some(mut record) = all.into_iter().find(|token| token.id == id) else { return Self::Unknown };
+        if !even_last && is_last && opens(&&record) {
+            return Self::Last;
+        }
+        record.revoked_ms = record.revoked_ms.or(Some(now_ms));
+        Self::Token(record)
+    }
+}
 
 /// A new job.
 #[derive(Clone, Debug)]
@@ -438,6 +468,15 @@ pub trait AccessStore: Send + Sync {
     async fn put_token(&self, token: &TokenRecord) -> Result<(), StoreError>;
     /// All tokens, by id.
     async fn tokens(&self) -> Result<Vec<TokenRecord>, StoreError>;
+    /// Ends the validity of a token, which stays listed; a repeated call does not move the time. Unless
+    /// `even_last`, the last one that can issue others stays valid. Callers in one process take turns.
+    async fn revoke_token(&self, id: &str, now_ms: u64, even_last: bool) -> Result<Revoked, StoreError> {
+        let revoked = Revoked::of(self.tokens().await?, id, now_ms, even_last);
+        if let Revoked::Token(record) = &revoked {
+            self.put_token(record).await?;
+        }
+        Ok(revoked)
+    }
 }
 
 /// A whole store. All times are Unix milliseconds of the caller's clock.
@@ -446,8 +485,21 @@ pub trait Store: JobStore + DatasetStore + AccessStore {
     /// The name of this deployment: random, made by the first call, and part of every export. A bucket with
     /// its files bears the same name.
     async fn deployment(&self) -> Result<String, StoreError>;
+    /// The blobs of a bucket as rows that several coordinators share; `None` in a store of one process.
+    fn ledger(&self) -> Option<Arc<dyn Ledger>> {
+        None
+    }
+    /// The coordinators that share the store; `None` in a store of one process.
+    fn members(&self) -> Option<Arc<dyn Members>> {
+        None
+    }
     /// All data of the store, for a file.
     async fn export(&self) -> Result<Export, StoreError>;
     /// Imports all data of another store; only into an empty one.
     async fn import(&self, export: &Export) -> Result<(), StoreError>;
+    /// Log lines of jobs, of which an attempt keeps at most `attempt_bytes`; `None` where they are in files
+    /// beside the store.
+    fn logs(&self, _attempt_bytes: u64) -> Option<Arc<dyn Logs>> {
+        None
+    }
 }

@@ -7,7 +7,8 @@ use tokio::net::TcpStream;
 use tonic::Status;
 use tonic::service::interceptor::InterceptedService;
 
-use super::{Dial, DialError, cause, reason};
+use super::transport::Unanswered;
+use super::{Dial, DialError, cause, reason, root_cause};
 use crate::v1::GetJobRequest;
 use crate::v1::job_service_client::JobServiceClient;
 
@@ -23,10 +24,17 @@ const TLS_ALERT: &[u8] = &[0x15, 0x03];
 impl Dial {
     /// The reason why a call that failed with `status` will always fail: the server speaks another protocol,
     /// or refuses our certificate. `None` where the coordinator itself refused the call, or where a retry may
-    /// help.
+    /// help. With several addresses, the faults of all of them: a retry may reach any other.
     pub async fn misdialled(&self, status: &Status) -> Option<DialError> {
         if reason(status).is_some() || self.connector.is_some() {
             return None;
+        }
+        if self.url.contains(',') {
+            let mut faults = Vec::new();
+            for one in self.each() {
+                faults.push(one.lasting_fault().await?);
+            }
+            return Some(all_of(faults));
         }
         match self.fault_of_tls(&cause(status)) {
             Some(error) => Some(error),
@@ -36,12 +44,49 @@ impl Dial {
         }
     }
 
+    /// Why a connection attempt that failed with `said` will always fail.
+    pub(super) async fn fault_of_connecting(&self, said: &str) -> Option<DialError> {
+        self.other_protocol().await.or_else(|| self.fault_of_tls(said))
+    }
+
+    /// The error for several addresses of which none answers.
+    pub(super) async fn fault_of_each(&self, unanswered: Unanswered) -> DialError {
+        let (mut reasons, mut faults, of) = (Vec::new(), Vec::new(), unanswered.0.len());
+        for (url, said) in unanswered.0 {
+            let one = Self { url, ..self.clone() };
+            match one.fault_of_connecting(&said).await {
+                Some(fault) => {
+                    reasons.push((one.url, fault.to_string()));
+                    faults.push(fault);
+                }
+                None => reasons.push((one.url, said)),
+            }
+        }
+        if faults.len() == of && of > 0 {
+            return all_of(faults);
+        }
+        DialError::Connect(Unanswered(reasons).to_string())
+    }
+
+    /// Why this one address will never lead to a coordinator, by an attempt; `None` where it may.
+    async fn lasting_fault(&self) -> Option<DialError> {
+        if self.url.starts_with("http://") {
+            return self.other_protocol().await;
+        }
+        let endpoint = self.prepare().ok()?.0.pop()?.endpoint;
+        match tokio::time::timeout(PROBE_WITHIN, endpoint.connect()).await.ok()? {
+            Ok(_) => self.not_trusted().await,
+            Err(error) => self.fault_of_tls(&root_cause(&error)),
+        }
+    }
+
     /// Whether the coordinator closes every connection once it has our certificate. In TLS 1.3 the client has
     /// finished its handshake by then, so the alert with the reason may be lost. An unreachable coordinator
     /// never gets that far.
     async fn not_trusted(&self) -> Option<DialError> {
         for _ in 0..3 {
-            let (endpoint, credentials) = self.prepare().ok()?;
+            let (mut addresses, credentials) = self.prepare().ok()?;
+            let endpoint = addresses.pop()?.endpoint;
             let channel = tokio::time::timeout(PROBE_WITHIN, endpoint.connect()).await.ok()?.ok()?;
             let mut jobs = JobServiceClient::new(InterceptedService::new(channel, credentials));
             let asked =
@@ -55,7 +100,8 @@ impl Dial {
                 return Some(error);
             }
         }
-        Some(DialError::Misdialled(self.refused_certificate("it closes every connection")))
+        let refused = || DialError::Misdialled(self.refused_certificate("it closes every connection"));
+        self.tls_identity.is_some().then(refused)
     }
 
     fn refused_certificate(&self, said: &str) -> String {
@@ -154,6 +200,12 @@ impl Dial {
         };
         DialError::Misdialled(fault)
     }
+}
+
+/// One error for the faults of all addresses.
+fn all_of(faults: Vec<DialError>) -> DialError {
+    let said: Vec<_> = faults.iter().map(ToString::to_string).collect();
+    DialError::Misdialled(said.join("; "))
 }
 
 /// The first bytes that an address answers to `begin`; empty where it closes silently.

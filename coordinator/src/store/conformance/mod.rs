@@ -12,7 +12,7 @@ mod sync;
 mod tenants;
 
 #[path = "../../../../tests/support/postgres.rs"]
-pub(super) mod postgres_server;
+pub(crate) mod postgres_server;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;

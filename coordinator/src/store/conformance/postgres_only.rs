@@ -255,13 +255,25 @@ async fn a_second_coordinator_is_kept_away_until_the_first_is_gone() {
     let Some(url) = database() else { return };
     let held = || tempfile::tempfile().unwrap();
     let first = PostgresStore::open(&options_of(&url)).await.unwrap();
-    first.hold_alone(Some(held())).await.unwrap();
+    first.hold(Hold::Alone, Some(held())).await.unwrap();
     let second = PostgresStore::open(&options_of(&url)).await.unwrap();
-    let waits = tokio::time::timeout(Duration::from_millis(1500), second.hold_alone(Some(held()))).await;
+    let waits =
+        tokio::time::timeout(Duration::from_millis(1500), second.hold(Hold::Alone, Some(held()))).await;
     assert!(waits.is_err(), "two coordinators have it");
     drop(first);
-    second.hold_alone(Some(held())).await.unwrap();
+    second.hold(Hold::Alone, Some(held())).await.unwrap();
     assert_eq!(second.failure(), None);
+    drop(second);
+    // Those whose files are in a bucket hold it together, and keep away others.
+    let mut together = Vec::new();
+    for _ in 0..2 {
+        let store = PostgresStore::open(&options_of(&url)).await.unwrap();
+        store.hold(Hold::WithOthers, None).await.unwrap();
+        together.push(store);
+    }
+    let other = PostgresStore::open(&options_of(&url)).await.unwrap();
+    let waits = tokio::time::timeout(Duration::from_millis(1500), other.hold(Hold::Alone, None)).await;
+    assert!(waits.is_err(), "one that cannot share its files has it too");
 }
 
 /// A killed server forgets nothing that it acknowledged; calls meanwhile end with an error that passes.

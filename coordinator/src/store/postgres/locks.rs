@@ -17,11 +17,25 @@ pub enum Held {
 
 /// Locks a tenant: its quota, its datasets, and the number of its jobs and leases.
 pub async fn tenant(tx: &mut PgConnection, tenant: &Tenant, held: Held) -> Result<(), StoreError> {
+    lock(tx, key("tenant", tenant.as_str().as_bytes()), held).await
+}
+
+/// Locks the bytes of a tenant: one upload after the other looks at them and adds its own.
+pub async fn bytes(tx: &mut PgConnection, tenant: &Tenant, held: Held) -> Result<(), StoreError> {
+    lock(tx, key("bytes", tenant.as_str().as_bytes()), held).await
+}
+
+/// Locks the revocation of tokens.
+pub async fn revocations(tx: &mut PgConnection) -> Result<(), StoreError> {
+    lock(tx, key("revocations", b""), Held::Alone).await
+}
+
+async fn lock(tx: &mut PgConnection, key: i64, held: Held) -> Result<(), StoreError> {
     let lock = match held {
         Held::WithOthers => sqlx::query("SELECT pg_advisory_xact_lock_shared($1)"),
         Held::Alone => sqlx::query("SELECT pg_advisory_xact_lock($1)"),
     };
-    lock.bind(key("tenant", tenant.as_str().as_bytes())).execute(tx).await.map_err(unavailable)?;
+    lock.bind(key).execute(tx).await.map_err(unavailable)?;
     Ok(())
 }
 

@@ -9,6 +9,9 @@
 //! | `jobs` | new jobs, deleted ones, lists |
 //! | `leases` | renewals and what is over |
 //! | `tenants`, `datasets` | quotas, tokens, datasets |
+//! | `ledger` | the blobs of a bucket |
+//! | `members` | the coordinators that use the database, and their workers |
+//! | `logs` | log lines |
 //! | `whole` | export, import, verification |
 //! | `rows`, `locks` | columns, and locks on things that are not rows |
 //!
@@ -19,12 +22,27 @@
 //! When the database cannot be reached, a call ends with [`StoreError::Unavailable`]. The next one tries
 //! again: nothing in this process has to be started anew.
 
+/// Runs `$work` on a connection, in time.
+macro_rules! on {
+    ($inner:expr, $pool:ident, |$conn:ident| $work:expr) => {{
+        let inner = &$inner;
+        let mut borrowed = Borrowed::from(&inner.$pool).await?;
+        let $conn = &mut *borrowed.conn;
+        let result = inner.in_time($work).await;
+        borrowed.done(&result);
+        result
+    }};
+}
+
 mod batch;
 mod claims;
 mod datasets;
 mod jobs;
 mod leases;
+mod ledger;
 mod locks;
+mod logs;
+mod members;
 mod opening;
 mod queue;
 mod rows;
@@ -46,15 +64,20 @@ use tonic::async_trait;
 
 use self::batch::{Answer, Change};
 use self::claims::Hints;
-pub use self::opening::PostgresOptions;
+use self::ledger::PostgresLedger;
+use self::members::PostgresMembers;
+pub use self::opening::{Hold, PostgresOptions};
 use self::queue::WaitingChanges;
 use super::export::Export;
+use super::ledger::Ledger;
+use super::members::Members;
 use super::{
-    AccessStore, Claim, DatasetStore, Grant, JobFilter, JobStore, JobView, Levels, NewJob, Store, StoreError,
-    StoredEvent, WorkerMark,
+    AccessStore, Claim, DatasetStore, Grant, JobFilter, JobStore, JobView, Levels, NewJob, Revoked, Store,
+    StoreError, StoredEvent, WorkerMark,
 };
 use crate::access::TokenRecord;
 use crate::datasets::{DatasetId, DatasetRecord, NewDataset};
+use crate::logs::Logs;
 use crate::schedule::{
     Attempt, Event, Expired, JobId, JobRecord, Lease, LiveProgress, OpenWork, Outcome, Quota, ReadyTask,
     Refusal, Renewed, Rules, TaskId, TaskRecord, Tenant, Usage,
@@ -63,6 +86,9 @@ use crate::schedule::{
 /// Longest time for one transaction. The database ends statements and waits for locks before
 /// (`opening`), so only a cut network takes this long.
 const ANSWER_WITHIN: Duration = Duration::from_secs(20);
+
+/// Time without any coordinator that costs no worker its lease; coordinators report themselves every second.
+const SHORT_GAP_MS: u64 = 2500;
 
 /// Jobs in PostgreSQL.
 pub struct PostgresStore(Arc<Inner>);
@@ -79,7 +105,9 @@ struct Inner {
     /// Moves with every lease that this process grants.
     grants: AtomicU64,
     connect: PgConnectOptions,
-    /// Keeps other coordinators away.
+    /// The name of this process among the coordinators, new in every process.
+    member: String,
+    /// Keeps other coordinators away, all of them or those that cannot share the files.
     holds: OnceLock<AbortHandle>,
     failure: OnceLock<String>,
 }
@@ -187,18 +215,6 @@ fn unavailable(error: sqlx::Error) -> StoreError {
     StoreError::Unavailable(error.to_string())
 }
 
-/// Runs `$work` on a connection, in time.
-macro_rules! on {
-    ($inner:expr, $pool:ident, |$conn:ident| $work:expr) => {{
-        let inner = &$inner;
-        let mut borrowed = Borrowed::from(&inner.$pool).await?;
-        let $conn = &mut *borrowed.conn;
-        let result = inner.in_time($work).await;
-        borrowed.done(&result);
-        result
-    }};
-}
-
 #[async_trait]
 impl JobStore for PostgresStore {
     async fn submit(&self, new: NewJob, now_ms: u64) -> Result<JobRecord, StoreError> {
@@ -256,12 +272,18 @@ impl JobStore for PostgresStore {
         let given_ms = self.0.settings.given_ms(now_ms);
         // Other coordinators renew theirs.
         for lease in on!(self.0, pool, |conn| leases::abandoned_own(conn, given_ms))? {
-            let reason = "its coordinator is gone".to_owned();
             let job = lease.job.clone();
-            match self.0.apply(&job, Event::Release { lease, reason }, now_ms).await {
+            match self.0.change(&job, None, Change::Expire(lease), now_ms).await {
                 Ok(_) | Err(StoreError::Refused(_) | StoreError::JobNotFound(_)) => {}
                 Err(error) => return Err(error),
             }
+        }
+        // While another coordinator took calls, workers could renew. A coordinator that crashes at every
+        // start would keep the leases of dead workers alive.
+        let alone_for_ms = on!(self.0, pool, |conn| members::alone_for_ms(conn))?;
+        let short_ms = SHORT_GAP_MS.min(self.0.settings.lease_ms / 4);
+        if alone_for_ms.is_some_and(|alone_for_ms| alone_for_ms <= short_ms) {
+            return Ok(());
         }
         self.extend_leases(now_ms).await
     }
@@ -423,12 +445,24 @@ impl AccessStore for PostgresStore {
     async fn tokens(&self) -> Result<Vec<TokenRecord>, StoreError> {
         on!(self.0, pool, |conn| tenants::tokens(conn))
     }
+
+    async fn revoke_token(&self, id: &str, now_ms: u64, even_last: bool) -> Result<Revoked, StoreError> {
+        on!(self.0, pool, |conn| tenants::revoke(conn, id, now_ms, even_last))
+    }
 }
 
 #[async_trait]
 impl Store for PostgresStore {
     async fn deployment(&self) -> Result<String, StoreError> {
         on!(self.0, pool, |conn| whole::deployment(conn))
+    }
+
+    fn ledger(&self) -> Option<Arc<dyn Ledger>> {
+        Some(Arc::new(PostgresLedger(Arc::clone(&self.0))))
+    }
+
+    fn members(&self) -> Option<Arc<dyn Members>> {
+        Some(Arc::new(PostgresMembers(Arc::clone(&self.0))))
     }
 
     async fn export(&self) -> Result<Export, StoreError> {
@@ -444,6 +478,10 @@ impl Store for PostgresStore {
         borrowed.done(&imported);
         self.0.changed();
         imported
+    }
+
+    fn logs(&self, attempt_bytes: u64) -> Option<Arc<dyn Logs>> {
+        Some(self.logs_of(attempt_bytes))
     }
 }
 

@@ -9,6 +9,7 @@ use std::time::{Duration, Instant};
 use sqlx::migrate::{MigrateError, Migration, MigrationType, Migrator};
 use sqlx::postgres::{PgConnectOptions, PgPoolOptions};
 use sqlx::{Connection, PgConnection, PgPool, SqlSafeStr};
+use uuid::Uuid;
 
 use super::super::{PROGRAM, StoreError};
 use super::claims::Hints;
@@ -22,8 +23,8 @@ const CONNECT_WITHIN: Duration = Duration::from_secs(3);
 const WATCH_EVERY: Duration = Duration::from_secs(5);
 /// Time in which the database notices that a coordinator is gone; see [`SESSION`].
 const TAKE_OVER_WITHIN: Duration = Duration::from_secs(30);
-/// The lock of the one coordinator.
-const ONE_COORDINATOR: i64 = 0x6661_7468_6f6d;
+/// The lock that coordinators hold together, or one of them alone.
+const OF_COORDINATORS: i64 = 0x6661_7468_6f6d;
 /// The database itself ends what takes longer, so that a coordinator behind a cut network holds no lock.
 /// The same for connections whose client has gone without a word.
 const SESSION: [(&str, &str); 9] = [
@@ -54,6 +55,15 @@ pub struct PostgresOptions {
     pub stall_ms: u64,
     /// Most connections to the database; an eighth of them, at least one, is for renewals.
     pub connections: u32,
+}
+
+/// How a coordinator holds its database.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Hold {
+    /// Together with others that hold it so.
+    WithOthers,
+    /// Alone.
+    Alone,
 }
 
 impl PostgresOptions {
@@ -112,20 +122,21 @@ impl PostgresStore {
             version: AtomicU64::new(0),
             grants: AtomicU64::new(0),
             connect,
+            member: Uuid::new_v4().to_string(),
             holds: OnceLock::new(),
             failure: OnceLock::new(),
         })))
     }
 
-    /// Refuses when another coordinator uses the database, and keeps others away until this store is dropped.
-    /// `with` is held as long.
+    /// Refuses when another coordinator uses the database in a way that excludes this one, and keeps such
+    /// ones away until this store is dropped. `with` is held as long.
     ///
     /// # Errors
     /// When another one has it, or the database cannot be reached.
-    pub async fn hold_alone(&self, with: Option<File>) -> Result<(), StoreError> {
+    pub async fn hold(&self, hold: Hold, with: Option<File>) -> Result<(), StoreError> {
         let mut waits_since = None;
         let held = loop {
-            if let Some(held) = lock_alone(&self.0.connect).await? {
+            if let Some(held) = lock(&self.0.connect, hold).await? {
                 break held;
             }
             // The database may not have noticed yet that a killed one is gone.
@@ -139,7 +150,7 @@ impl PostgresStore {
             }
             tokio::time::sleep(WATCH_EVERY / 10).await;
         };
-        let watch = tokio::spawn(watch_alone(Arc::downgrade(&self.0), held, with));
+        let watch = tokio::spawn(watch(Arc::downgrade(&self.0), hold, held, with));
         // Once only: a store is opened for one coordinator.
         let _ = self.0.holds.set(watch.abort_handle());
         Ok(())
@@ -158,7 +169,7 @@ fn connect_options(url: &str) -> Result<PgConnectOptions, StoreError> {
     Ok(connect.application_name("fathom-coordinator").options(SESSION))
 }
 
-fn pool(connect: PgConnectOptions, connections: u32) -> PgPool {
+pub(super) fn pool(connect: PgConnectOptions, connections: u32) -> PgPool {
     let options = PgPoolOptions::new().max_connections(connections).acquire_timeout(CONNECT_WITHIN);
     options.connect_lazy_with(connect)
 }
@@ -182,19 +193,19 @@ async fn migrate(conn: &mut PgConnection) -> Result<(), StoreError> {
     })
 }
 
-/// A connection that keeps other coordinators away; `None` if one has the database.
-async fn lock_alone(connect: &PgConnectOptions) -> Result<Option<PgConnection>, StoreError> {
+/// A connection that holds the database; `None` if another coordinator excludes that.
+async fn lock(connect: &PgConnectOptions, hold: Hold) -> Result<Option<PgConnection>, StoreError> {
     let mut conn = PgConnection::connect_with(connect).await.map_err(unavailable)?;
-    let got: bool = sqlx::query_scalar("SELECT pg_try_advisory_lock($1)")
-        .bind(ONE_COORDINATOR)
-        .fetch_one(&mut conn)
-        .await
-        .map_err(unavailable)?;
+    let lock = match hold {
+        Hold::WithOthers => sqlx::query_scalar("SELECT pg_try_advisory_lock_shared($1)"),
+        Hold::Alone => sqlx::query_scalar("SELECT pg_try_advisory_lock($1)"),
+    };
+    let got: bool = lock.bind(OF_COORDINATORS).fetch_one(&mut conn).await.map_err(unavailable)?;
     Ok(got.then_some(conn))
 }
 
 /// Takes the lock again when its connection was lost; ends the store if another coordinator was faster.
-async fn watch_alone(store: Weak<Inner>, mut held: PgConnection, _with: Option<File>) {
+async fn watch(store: Weak<Inner>, hold: Hold, mut held: PgConnection, _with: Option<File>) {
     let mut lost: Option<Instant> = None;
     loop {
         tokio::time::sleep(WATCH_EVERY).await;
@@ -203,7 +214,7 @@ async fn watch_alone(store: Weak<Inner>, mut held: PgConnection, _with: Option<F
         if matches!(lives, Ok(Ok(()))) {
             continue;
         }
-        match tokio::time::timeout(CONNECT_WITHIN, lock_alone(&store.connect)).await {
+        match tokio::time::timeout(CONNECT_WITHIN, lock(&store.connect, hold)).await {
             Ok(Ok(Some(again))) => (held, lost) = (again, None),
             Ok(Ok(None)) => {
                 // It may still be the lost connection, of which the database does not know yet.

@@ -2,8 +2,8 @@
 
 use sqlx::{Connection, PgConnection};
 
-use super::super::StoreError;
 use super::super::record::{decode, encode};
+use super::super::{Revoked, StoreError};
 use super::locks::{self, Held};
 use super::unavailable;
 use crate::access::TokenRecord;
@@ -117,4 +117,22 @@ pub fn parse(table: &'static str, tenant: &str) -> Result<Tenant, StoreError> {
         tree: table,
         message: error.to_string(),
     })
+}
+
+/// Revokes a token. Two revocations at once could each count on the other's token, so they take turns, also
+/// at several coordinators.
+pub async fn revoke(
+    conn: &mut PgConnection,
+    id: &str,
+    now_ms: u64,
+    even_last: bool,
+) -> Result<Revoked, StoreError> {
+    let mut tx = conn.begin().await.map_err(unavailable)?;
+    locks::revocations(&mut tx).await?;
+    let revoked = Revoked::of(tokens(&mut tx).await?, id, now_ms, even_last);
+    if let Revoked::Token(record) = &revoked {
+        write_token(&mut tx, record).await?;
+    }
+    tx.commit().await.map_err(unavailable)?;
+    Ok(revoked)
 }

@@ -196,6 +196,9 @@ pub async fn import(conn: &mut PgConnection, export: &Export) -> Result<(), Stor
     for dataset in &export.datasets {
         datasets::write(&mut tx, dataset).await?;
     }
+    // Its bucket is another one, or will be listed anew.
+    let clear = sqlx::query("TRUNCATE blobs, uploads, blob_bytes, filled_ledgers");
+    clear.execute(&mut *tx).await.map_err(unavailable)?;
     if let Some(exported) = &export.deployment {
         // An empty database may have been named when a coordinator tried it.
         sqlx::query("DELETE FROM deployment").execute(&mut *tx).await.map_err(unavailable)?;

@@ -101,3 +101,115 @@ CREATE TABLE datasets (
     row bytea NOT NULL,
     PRIMARY KEY (tenant, dataset)
 );
+
+-- The coordinators that use this database, each with a name that is new in every process.
+CREATE TABLE members (
+    member text PRIMARY KEY,
+    seen_ms bigint NOT NULL
+) WITH (fillfactor = 30);
+
+-- Workers that have called any of them lately.
+CREATE TABLE workers (
+    incarnation text COLLATE "C" PRIMARY KEY,
+    owner text NOT NULL,
+    seen_ms bigint NOT NULL,
+    registered_ms bigint NOT NULL,
+    row bytea NOT NULL
+) WITH (fillfactor = 50);
+
+-- Whether a coordinator has reported itself lately. It does so every second.
+CREATE FUNCTION is_member(text) RETURNS boolean LANGUAGE sql STABLE
+    AS $$ SELECT EXISTS (SELECT 1 FROM members WHERE member = $1 AND seen_ms > now_ms() - 30000) $$;
+
+-- The blobs of a bucket. While `going_until_ms` is set, garbage collection is deleting the object.
+CREATE TABLE blobs (
+    tenant text COLLATE "C" NOT NULL,
+    digest bytea NOT NULL,
+    bytes bigint NOT NULL,
+    used_ms bigint NOT NULL,
+    going_until_ms bigint,
+    PRIMARY KEY (tenant, digest)
+) WITH (fillfactor = 90);
+
+-- Uploads into a bucket that are not complete. They count all declared bytes while a stream writes, else the
+-- bytes that have arrived.
+CREATE TABLE uploads (
+    tenant text COLLATE "C" NOT NULL,
+    digest bytea NOT NULL,
+    bytes bigint NOT NULL,
+    member text NOT NULL,
+    is_written boolean NOT NULL,
+    changed_ms bigint NOT NULL,
+    PRIMARY KEY (tenant, digest)
+) WITH (fillfactor = 70);
+
+-- Tenants whose blobs are all in `blobs`.
+CREATE TABLE filled_ledgers (
+    tenant text COLLATE "C" PRIMARY KEY
+);
+
+-- Sums of `blobs` and `uploads`, by the first hex digit of the digest.
+CREATE TABLE blob_bytes (
+    tenant text COLLATE "C" NOT NULL,
+    part smallint NOT NULL,
+    bytes bigint NOT NULL,
+    PRIMARY KEY (tenant, part)
+) WITH (fillfactor = 30);
+
+CREATE FUNCTION count_blob_bytes() RETURNS trigger LANGUAGE plpgsql AS $$
+DECLARE
+    one record;
+    more bigint := 0;
+BEGIN
+    IF TG_OP = 'DELETE' THEN one := OLD; ELSE one := NEW; END IF;
+    IF TG_OP <> 'DELETE' THEN more := more + NEW.bytes; END IF;
+    IF TG_OP <> 'INSERT' THEN more := more - OLD.bytes; END IF;
+    IF more <> 0 THEN
+        INSERT INTO blob_bytes AS sums VALUES (one.tenant, get_byte(one.digest, 0) / 16, more)
+            ON CONFLICT (tenant, part) DO UPDATE SET bytes = sums.bytes + more;
+    END IF;
+    RETURN NULL;
+END $$;
+CREATE TRIGGER count_bytes AFTER INSERT OR DELETE OR UPDATE OF bytes ON blobs
+    FOR EACH ROW EXECUTE FUNCTION count_blob_bytes();
+CREATE TRIGGER count_bytes AFTER INSERT OR DELETE OR UPDATE OF bytes ON uploads
+    FOR EACH ROW EXECUTE FUNCTION count_blob_bytes();
+
+-- An append of log lines locks the row of its job here until the commit, so that their numbers become visible
+-- in their order. Every batch changes the row and that of its attempt.
+CREATE TABLE log_jobs (
+    job_id text COLLATE "C" PRIMARY KEY,
+    last bigint NOT NULL
+) WITH (fillfactor = 50);
+
+-- `starts` has the first numbers of the segments after the first one, `bytes` the size of the latest one.
+CREATE TABLE log_attempts (
+    job_id text COLLATE "C" NOT NULL,
+    stage smallint NOT NULL,
+    part bigint NOT NULL,
+    attempt bigint NOT NULL,
+    fence bigint,
+    worker bytea,
+    last_from_worker bigint NOT NULL,
+    bytes bigint NOT NULL,
+    starts bigint[] NOT NULL,
+    PRIMARY KEY (job_id, stage, part, attempt)
+) WITH (fillfactor = 50);
+
+-- `number` is even, and ascends in the job in the order of arrival. `after_cut`: lines of the same attempt
+-- before this one were removed.
+CREATE TABLE log_lines (
+    number bigint NOT NULL,
+    part bigint NOT NULL,
+    attempt bigint NOT NULL,
+    from_worker bigint,
+    time_ms bigint NOT NULL,
+    stage smallint NOT NULL,
+    severity smallint NOT NULL,
+    after_cut boolean NOT NULL,
+    job_id text COLLATE "C" NOT NULL,
+    worker bytea NOT NULL,
+    message bytea NOT NULL,
+    PRIMARY KEY (job_id, number)
+);
+CREATE INDEX log_lines_of_task ON log_lines (job_id, stage, part, number);
