@@ -42,6 +42,9 @@ SOUND = {
     "before workers have a token": ["coordinator.tlsSecret=tls"],
     "safe": SAFE + ["networkPolicy.clientCidrs={10.0.0.0/8}"],
     "database and bucket": SAFE + ENGINES,
+    "the values of an earlier chart": SAFE + ["coordinator.replicas=null"],
+    "several coordinators": SAFE + ENGINES + ["coordinator.replicas=3", "coordinator.storage.className=fast"],
+    "several coordinators with KEDA": SAFE + ENGINES + KEDA + ["coordinator.replicas=2"],
     "KEDA": SAFE + ENGINES + KEDA + ["workers.pools[0].name=large", "workers.pools[0].aboveMib=8000", "imagePullSecrets={one,two}"],
     "KEDA in plain text": OPEN + ["keda.enabled=true", "networkPolicy.enabled=false", "workers.runtimeClassName="],
 }
@@ -52,6 +55,8 @@ REFUSED = {
     "keda.clientSecret": SAFE + ["keda.enabled=true"],
     "needs coordinator.tlsSecret": OPEN + KEDA,
     "replicaz": OPEN + ["workers.pools[0].name=gpu", "workers.pools[0].replicaz=3"],
+    "set database.secret and objects.url": SAFE + ["coordinator.replicas=2", "database.secret=database"],
+    "/coordinator/replicas": SAFE + ENGINES + ["coordinator.replicas=0"],
     "/objects/url": OPEN + ["objects.url=reef"],
 }
 
@@ -187,6 +192,9 @@ def check_chart():
         has_workers = any(document["metadata"]["name"] == "reef-fathom-gpu" for document in documents)
         if has_workers == (pairs == ["coordinator.tlsSecret=tls"]) and "large" not in str(pairs):
             fail(f"the chart ({where}) starts {'' if has_workers else 'no '}workers")
+        is_one = not {"coordinator.replicas=2", "coordinator.replicas=3"}.intersection(pairs)
+        if is_one != any(document["kind"] == "PersistentVolumeClaim" for document in documents):
+            fail(f"the chart ({where}): only a single coordinator has a volume that stays")
         if bool(of_keda) != any(pair == "keda.enabled=true" for pair in pairs):
             fail(f"the chart ({where}) has {len(of_keda)} objects of KEDA")
     for sentence, pairs in REFUSED.items():

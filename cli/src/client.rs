@@ -2,11 +2,9 @@
 //!
 //! All calls are safe to repeat (see `job.proto`), so calls are retried while a coordinator restarts.
 
-use std::path::Path;
 use std::time::Duration;
 
 use backon::{ExponentialBuilder, Retryable as _};
-use fathom_core::paths::check_inside;
 use fathom_observe::shown;
 use fathom_proto::admin::v1::admin_service_client::AdminServiceClient;
 use fathom_proto::admin::v1::{
@@ -15,6 +13,7 @@ use fathom_proto::admin::v1::{
     Token, UncordonWorkerRequest, Worker,
 };
 use fathom_proto::dial::{Connection, Dial, DialError, cause, reason};
+use fathom_proto::direct::Direct;
 use fathom_proto::v1::job_service_client::JobServiceClient;
 use fathom_proto::v1::upload_service_client::UploadServiceClient;
 use fathom_proto::v1::{
@@ -23,11 +22,9 @@ use fathom_proto::v1::{
     JobEvent, ListArtifactsRequest, ListDatasetsRequest, ListJobsRequest, LogEntry, PauseJobRequest,
     ReadBlobRequest, ResumeJobRequest, RetryJobRequest, StreamLogsRequest, UpdateJobRequest, WatchJobRequest,
 };
-use tokio::io::AsyncWriteExt as _;
 use tonic::{Code, Status, Streaming};
 
 use crate::error::{CliError, Result};
-use crate::progress::{Progress, Unit};
 
 /// A coordinator.
 #[derive(Clone)]
@@ -37,6 +34,8 @@ pub struct Client {
     pub jobs: JobServiceClient<Connection>,
     pub uploads: UploadServiceClient<Connection>,
     pub admin: AdminServiceClient<Connection>,
+    /// Fetches files from the coordinator's bucket.
+    pub direct: Direct,
 }
 
 /// A lost connection is retried for about a minute; a coordinator restarts within seconds.
@@ -93,6 +92,7 @@ impl Client {
             jobs: JobServiceClient::new(connection.clone()).max_decoding_message_size(64 << 20),
             uploads: UploadServiceClient::new(connection.clone()).max_decoding_message_size(64 << 20),
             admin: AdminServiceClient::new(connection).max_decoding_message_size(64 << 20),
+            direct: Direct::default(),
         })
     }
 
@@ -330,94 +330,8 @@ impl Client {
         }
     }
 
-    /// Writes all files of a succeeded job under `out`.
-    ///
-    /// Existing files with the right content are kept. All others are written under a temporary name, hashed
-    /// and renamed, so `out` never holds a partial file.
-    pub async fn download(&self, id: &str, out: &Path) -> Result<Vec<String>> {
-        let artifacts = self.artifacts(id).await?;
-        let total = artifacts.iter().filter_map(|a| a.blob.as_ref()).map(|blob| blob.size_bytes).sum();
-        // Never replace a file of another origin; a file that an earlier download wrote is identical.
-        for artifact in &artifacts {
-            let Some(blob) = &artifact.blob else { continue };
-            let path = safe_path(out, &artifact.path)?;
-            if path.exists() && !holds(&path, blob) {
-                return Err(CliError::Message(format!(
-                    "{} already exists with other content; choose another folder, or move it away",
-                    path.display()
-                )));
-            }
-        }
-        let progress = Progress::new("downloading", total, Unit::Bytes);
-        let mut done = 0;
-        for artifact in &artifacts {
-            let Some(blob) = &artifact.blob else { continue };
-            let path = safe_path(out, &artifact.path)?;
-            if let Some(folder) = path.parent() {
-                std::fs::create_dir_all(folder).map_err(CliError::io("create", folder))?;
-            }
-            if !holds(&path, blob) {
-                let base = done;
-                self.fetch(id, blob, &path, |arrived| progress.set(base + arrived, &artifact.path)).await?;
-            }
-            done += blob.size_bytes;
-            progress.set(done, &artifact.path);
-        }
-        Ok(artifacts.into_iter().map(|artifact| artifact.path).collect())
-    }
-
-    async fn fetch(&self, job: &str, blob: &BlobRef, path: &Path, arrived: impl Fn(u64)) -> Result<()> {
-        let partial = path.with_file_name(format!(
-            ".{}.part",
-            path.file_name().map_or_else(|| "file".into(), |name| name.to_string_lossy())
-        ));
-        let write = || CliError::io("write", &partial);
-        let mut file = tokio::fs::File::create(&partial).await.map_err(write())?;
-        let (mut hasher, mut offset, mut failures) = (blake3::Hasher::new(), 0_u64, 0);
-        while offset < blob.size_bytes {
-            let request =
-                ReadBlobRequest { digest: blob.digest.clone(), offset_bytes: offset, job_id: job.to_owned() };
-            let call = || async { self.uploads.clone().read_blob(request.clone()).await };
-            let mut stream = self.patient("send a file", call).await?;
-            let before = offset;
-            let end = loop {
-                match stream.message().await {
-                    Ok(Some(piece)) => {
-                        file.write_all(&piece.data).await.map_err(write())?;
-                        hasher.update(&piece.data);
-                        offset += piece.data.len() as u64;
-                        arrived(offset);
-                    }
-                    Ok(None) => break None,
-                    Err(status) => break Some(status),
-                }
-            };
-            failures = if offset > before { 0 } else { failures + 1 };
-            match end {
-                Some(status) if !passing(&status) || failures > 16 => {
-                    return Err(self.fault("send a file", &status));
-                }
-                None if offset < blob.size_bytes && failures > 16 => {
-                    return Err(CliError::Message(format!(
-                        "the coordinator's copy of {} is truncated",
-                        path.display()
-                    )));
-                }
-                _ => {}
-            }
-        }
-        file.sync_all().await.map_err(write())?;
-        if hasher.finalize().to_hex().as_str() != blob.digest {
-            return Err(CliError::Message(format!(
-                "{} does not match the digest that the coordinator announced; run the download again",
-                path.display()
-            )));
-        }
-        tokio::fs::rename(&partial, path).await.map_err(CliError::io("rename", path))
-    }
-
     /// Retries a call while its failure is temporary.
-    async fn patient<T, F, Fut>(&self, action: &'static str, mut call: F) -> Result<T>
+    pub async fn patient<T, F, Fut>(&self, action: &'static str, mut call: F) -> Result<T>
     where
         F: FnMut() -> Fut,
         Fut: Future<Output = std::result::Result<tonic::Response<T>, Status>>,
@@ -450,24 +364,6 @@ fn unreachable(dial: &Dial, error: DialError) -> CliError {
     }
 }
 
-/// The path of an artifact under `out`. A path that would leave `out` is refused, even from the coordinator.
-pub fn safe_path(out: &Path, relative: &str) -> Result<std::path::PathBuf> {
-    match check_inside(relative) {
-        Ok(()) => Ok(out.join(relative)),
-        Err(fault) => {
-            let shown: String = relative.chars().take(80).collect();
-            Err(CliError::Message(format!(
-                "the coordinator sent a file named {shown:?}, whose path {fault}; nothing was written"
-            )))
-        }
-    }
-}
-
-fn holds(path: &Path, blob: &BlobRef) -> bool {
-    let same_size = std::fs::metadata(path).is_ok_and(|meta| meta.len() == blob.size_bytes);
-    same_size && crate::blob::digest_file(path).is_ok_and(|digest| digest.digest == blob.digest)
-}
-
 #[cfg(test)]
 mod tests {
     use tonic_types::{ErrorDetails, StatusExt as _};
@@ -487,14 +383,5 @@ mod tests {
         assert!(matches!(spent, CliError::Refused { .. }), "{spent}");
         let gone = fault("http://wreck".into(), "list", &Status::unavailable("nobody"));
         assert!(matches!(gone, CliError::Unreachable { .. }), "{gone}");
-    }
-
-    #[test]
-    fn a_path_that_leaves_the_folder_is_refused() {
-        let out = Path::new("/tmp/out");
-        assert_eq!(safe_path(out, "renders/a.png").ok(), Some(out.join("renders/a.png")));
-        for wrong in ["../a", "/etc/passwd", "a/../../b", "", "a//b", "C:\\a"] {
-            assert!(safe_path(out, wrong).is_err(), "{wrong}");
-        }
     }
 }

@@ -6,8 +6,8 @@ use std::path::Path;
 use fathom_core::config::JobConfig;
 use fathom_fuzz::{Folder, Target, run};
 
-use crate::client::safe_path;
 use crate::config_args::JobArgs;
+use crate::download::safe_path;
 use crate::eval_summary::summary;
 use crate::{model, output};
 

@@ -10,6 +10,7 @@ mod children;
 mod client;
 mod config_args;
 mod dial_args;
+mod download;
 mod error;
 mod eval_summary;
 #[cfg(test)]

@@ -6,9 +6,10 @@ use std::time::Instant;
 use bytes::Bytes;
 use fathom_core::config::JobConfig;
 use fathom_core::scene::{BlobRef, Manifest, ManifestView, Purpose, Scene, load_scene};
+use fathom_proto::direct::Content;
 use fathom_proto::v1::{
     self, BeginUploadRequest, CreateJobRequest, Dataset, DatasetFile, FindMissingBlobsRequest, Job,
-    QueryBlobRequest, WriteBlobRequest,
+    QueryBlobRequest, QueryBlobResponse, WriteBlobRequest,
 };
 use tokio::io::{AsyncReadExt as _, AsyncSeekExt as _};
 use tokio_stream::wrappers::ReceiverStream;
@@ -31,12 +32,6 @@ pub struct Prepared {
     pub manifest: Manifest,
     pub warnings: Vec<String>,
     files: Vec<(BlobRef, Content)>,
-}
-
-#[derive(Clone)]
-enum Content {
-    File(PathBuf),
-    Bytes(Bytes),
 }
 
 /// Reads a scene for training and hashes all of its files.
@@ -222,8 +217,10 @@ async fn upload(client: &Client, mut files: Vec<(BlobRef, Content)>) -> Result<(
 async fn write_blob(client: &Client, blob: &BlobRef, content: &Content) -> Result<()> {
     let mut failures = 0;
     let mut known = 0;
+    // One attempt sends it to the bucket.
+    let mut may_be_direct = true;
     loop {
-        let status = match write_once(client, blob, content).await {
+        let status = match write_once(client, blob, content, &mut may_be_direct).await {
             Ok(true) => return Ok(()),
             Ok(false) => tonic::Status::unavailable("the stream ended before the file did"),
             Err(WriteFault::File(error)) => return Err(error),
@@ -233,7 +230,7 @@ async fn write_blob(client: &Client, blob: &BlobRef, content: &Content) -> Resul
         if !passing(&status) && status.code() != tonic::Code::OutOfRange {
             return Err(client.fault("take a file", &status));
         }
-        let committed = query(client, blob).await.unwrap_or(known);
+        let committed = query(client, blob).await.map_or(known, |arrived| arrived.committed_size_bytes);
         failures = if committed > known { 0 } else { failures + 1 };
         known = committed;
         if failures > MAX_FAILURES {
@@ -248,17 +245,26 @@ enum WriteFault {
     Call(tonic::Status),
 }
 
-async fn query(client: &Client, blob: &BlobRef) -> std::result::Result<u64, tonic::Status> {
+async fn query(client: &Client, blob: &BlobRef) -> std::result::Result<QueryBlobResponse, tonic::Status> {
     let request = QueryBlobRequest { blob: Some(to_proto(blob)), ..Default::default() };
-    Ok(client.uploads.clone().query_blob(request).await?.into_inner().committed_size_bytes)
+    Ok(client.uploads.clone().query_blob(request).await?.into_inner())
 }
 
 async fn write_once(
     client: &Client,
     blob: &BlobRef,
     content: &Content,
+    may_be_direct: &mut bool,
 ) -> std::result::Result<bool, WriteFault> {
-    let begin = query(client, blob).await.map_err(WriteFault::Call)?;
+    let arrived = query(client, blob).await.map_err(WriteFault::Call)?;
+    if arrived.direct
+        && std::mem::take(may_be_direct)
+        && client.direct.is_wanted()
+        && client.direct.upload(&client.uploads, &to_proto(blob), "", content.clone()).await
+    {
+        return Ok(true);
+    }
+    let begin = arrived.committed_size_bytes;
     let (sender, receiver) = tokio::sync::mpsc::channel(4);
     let (target, content) = (blob.clone(), content.clone());
     let reader = tokio::spawn(async move { send_pieces(&target, &content, begin, &sender).await });

@@ -1,12 +1,13 @@
-//! Measures how fast files go through a coordinator, to its disk and to a bucket.
+//! Measures how fast files go through a coordinator to its disk and to a bucket, and directly to the bucket.
 //!
 //! ```text
 //! cargo run --example transfer_scale -- [BLOBS] [MIB]
 //! ```
 //! 8 clients send 32 blobs of 32 MiB by default and fetch them again over gRPC on loopback. Then they do the
 //! same with as many bytes in blobs of 512 KiB. The blobs are first in a data directory, then in a bucket of
-//! an S3 server (`s3s-fs`, on the same disk). Clients, coordinator and S3 server share the cores, so the
-//! figures are lower bounds. It also counts the requests to the bucket.
+//! an S3 server (`s3s-fs`, on the same disk), and then the clients use that bucket themselves. Clients,
+//! coordinator and S3 server share the cores, so the figures are lower bounds. It also counts the requests to
+//! the bucket.
 
 #[path = "../../tests/support/s3.rs"]
 mod s3;
@@ -20,6 +21,7 @@ use bytes::Bytes;
 use fathom_coordinator::{CoordinatorConfig, serve};
 use fathom_core::scene::BlobRef;
 use fathom_proto::dial::{Connection, Dial};
+use fathom_proto::direct::{Content, Direct};
 use fathom_proto::v1;
 use fathom_proto::v1::upload_service_client::UploadServiceClient;
 
@@ -59,12 +61,15 @@ fn measure_all(objects: &str) -> Result<(), Failure> {
     let mut argument = |default: usize| arguments.next().map_or(Ok(default), |text| text.parse::<usize>());
     let (blobs, mib) = (argument(32)?, argument(32)?);
     let runtime = tokio::runtime::Runtime::new()?;
-    for (what, objects) in [("data directory", None), ("bucket", Some(objects))] {
+    let places =
+        [("data directory", None), ("bucket", Some("through")), ("bucket, directly", Some("direct"))];
+    for (what, prefix) in places {
         for (count, bytes) in [(blobs, mib << 20), (blobs * mib, 512 << 10)] {
             let dir = tempfile::tempdir()?;
             // A prefix belongs to one deployment.
-            let objects = objects.map(|objects| format!("{objects}/{count}"));
-            let (sent, fetched) = runtime.block_on(measure(dir.path(), objects, count, bytes))?;
+            let objects = prefix.map(|prefix| format!("{objects}/{prefix}-{count}"));
+            let direct = (prefix == Some("direct")).then(Direct::default);
+            let (sent, fetched) = runtime.block_on(measure(dir.path(), objects, direct, count, bytes))?;
             println!(
                 "{what}, {count} blobs of {bytes} bytes: sent {sent:.0} MB/s, fetched {fetched:.0} MB/s"
             );
@@ -77,6 +82,7 @@ fn measure_all(objects: &str) -> Result<(), Failure> {
 async fn measure(
     data_dir: &Path,
     objects: Option<String>,
+    direct: Option<Direct>,
     count: usize,
     bytes: usize,
 ) -> Result<(f64, f64), Failure> {
@@ -98,9 +104,14 @@ async fn measure(
     let begin = Instant::now();
     let lanes = clients.iter().enumerate().map(|(number, client)| {
         let (client, contents, blobs) = (client.clone(), contents.clone(), blobs.clone());
+        let direct = direct.clone();
         tokio::spawn(async move {
             for index in (number..blobs.len()).step_by(CLIENTS) {
-                send(client.clone(), &blobs[index], contents[index].clone()).await?;
+                let content = contents[index].clone();
+                match &direct {
+                    Some(direct) => send_directly(&client, direct, &blobs[index], content).await?,
+                    None => send(client.clone(), &blobs[index], content).await?,
+                }
             }
             Ok::<_, Failure>(())
         })
@@ -111,10 +122,10 @@ async fn measure(
     let sent = megabytes / begin.elapsed().as_secs_f64();
     let begin = Instant::now();
     let lanes = clients.into_iter().enumerate().map(|(number, client)| {
-        let blobs = blobs.clone();
+        let (blobs, direct) = (blobs.clone(), direct.clone());
         tokio::spawn(async move {
             for blob in blobs.iter().skip(number).step_by(CLIENTS) {
-                fetch(client.clone(), blob).await?;
+                fetch(client.clone(), direct.as_ref(), blob).await?;
             }
             Ok::<_, Failure>(())
         })
@@ -155,12 +166,34 @@ async fn send(
     if answer.complete { Ok(()) } else { Err("an upload is not complete".into()) }
 }
 
-async fn fetch(mut client: UploadServiceClient<Connection>, blob: &BlobRef) -> Result<(), Failure> {
-    let request = v1::ReadBlobRequest { digest: blob.digest.clone(), ..Default::default() };
+async fn send_directly(
+    client: &UploadServiceClient<Connection>,
+    direct: &Direct,
+    blob: &BlobRef,
+    content: Bytes,
+) -> Result<(), Failure> {
+    let named = v1::BlobRef { digest: blob.digest.clone(), size_bytes: blob.bytes };
+    let is_sent = direct.upload(client, &named, "", Content::Bytes(content)).await;
+    if is_sent { Ok(()) } else { Err("a file did not go directly to the bucket".into()) }
+}
+
+async fn fetch(
+    mut client: UploadServiceClient<Connection>,
+    direct: Option<&Direct>,
+    blob: &BlobRef,
+) -> Result<(), Failure> {
+    let digest = blob.digest.clone();
+    let request = v1::ReadBlobRequest { digest, direct: direct.is_some(), ..Default::default() };
     let mut pieces = client.read_blob(request).await?.into_inner();
     let mut hasher = blake3::Hasher::new();
     while let Some(piece) = pieces.message().await? {
         hasher.update(&piece.data);
+        if let Some(direct) = direct {
+            let mut pieces = direct.get(&piece.url, 0, blob.bytes).await?;
+            while let Some(data) = pieces.next().await? {
+                hasher.update(&data);
+            }
+        }
     }
     if hasher.finalize().to_hex().as_str() == blob.digest {
         Ok(())

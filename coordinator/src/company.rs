@@ -9,25 +9,33 @@ use std::sync::atomic::Ordering::Relaxed;
 use std::time::Duration;
 
 use futures::StreamExt;
+use tokio::sync::watch;
+use tokio::time::Instant;
 
+use crate::connections::Connections;
 use crate::state::{State, stopped};
 use crate::store::StoreError;
 use crate::store::members::{Hint, Members};
 
 /// Interval of reports. A revoked token must be refused everywhere within two seconds.
 const MEET_EVERY: Duration = Duration::from_secs(1);
+/// Longest and shortest time without the database after which clients are sent away; a quarter of a lease in
+/// between. A busy machine answers late, and a worker still has to register elsewhere before its lease ends.
+const AWAY_AFTER: [Duration; 2] = [Duration::from_secs(5), Duration::from_secs(2)];
 /// Changes within this time are one hint.
 const NOTIFY_EVERY: Duration = Duration::from_millis(50);
 /// Pause before it listens again after a failure of the database.
 const LISTEN_AGAIN_AFTER: Duration = Duration::from_secs(1);
 
 /// Keeps in touch with the other coordinators until this one stops.
-pub async fn keep_in_touch(shared: Arc<State>, members: Arc<dyn Members>) {
+pub async fn keep_in_touch(shared: Arc<State>, members: Arc<dyn Members>, connections: Arc<Connections>) {
     let mut stopping = shared.stopping.clone();
+    let met = watch::Sender::new(Instant::now());
     tokio::select! {
         biased;
         () = stopped(&mut stopping) => {}
-        () = meet(&shared, members.as_ref()) => {}
+        () = meet(&shared, members.as_ref(), &met) => {}
+        () = send_away(&shared, &connections, &met) => {}
         () = notify(&shared, members.as_ref()) => {}
         () = listen(&shared, members.as_ref()) => {}
     }
@@ -36,18 +44,28 @@ pub async fn keep_in_touch(shared: Arc<State>, members: Arc<dyn Members>) {
     }
 }
 
-async fn meet(shared: &State, members: &dyn Members) {
+/// Reports this coordinator to the others, and notes in `met` when that succeeded.
+async fn meet(shared: &State, members: &dyn Members, met: &watch::Sender<Instant>) {
     let mut since_ms = 0;
     loop {
-        match meet_once(shared, members, since_ms).await {
-            Ok(time_ms) => since_ms = time_ms,
+        // All workers anew after a failure: some may have been forgotten here meanwhile.
+        since_ms = match meet_once(shared, members, since_ms).await {
+            Ok(time_ms) => {
+                met.send_replace(Instant::now());
+                time_ms
+            }
             // The sweeper reports an outage.
-            Err(StoreError::Unavailable(_)) => {}
+            Err(StoreError::Unavailable(_)) => 0,
             Err(error) => {
                 tracing::error!(%error, "cannot read what the other coordinators know; what is known stays valid");
+                // The database answers, so clients can stay.
+                met.send_replace(Instant::now());
+                0
             }
-        }
-        tokio::time::sleep(MEET_EVERY).await;
+        };
+        // Twice as often as a gap in these reports extends the leases.
+        let of_lease = Duration::from_millis(u64::from(shared.lease_ms) / 8);
+        tokio::time::sleep(MEET_EVERY.min(of_lease)).await;
     }
 }
 
@@ -56,14 +74,42 @@ async fn meet_once(shared: &State, members: &dyn Members, since_ms: u64) -> Resu
     let marks_version = shared.workers.marks_version();
     let meeting = members.meet(&seen, since_ms, shared.workers.forget_after_ms()).await?;
     shared.members.store(meeting.members, Relaxed);
-    shared.workers.add_others(meeting.workers);
+    // After the workers were read and before they are known here: one whose token is unknown would lose its
+    // tasks.
+    shared.access.read_again(shared.store.as_ref()).await?;
+    let knows_all = shared.workers.add_others(meeting.workers);
+    for incarnation in meeting.forgotten {
+        if let Some(worker) = shared.workers.get(&incarnation) {
+            members.register(&incarnation, worker.owner_key(), &worker.to_row()?).await?;
+        }
+    }
     let marks = shared.jobs.worker_marks().await?;
     if shared.workers.set_marks(marks_version, marks) {
         // A worker may have to be drained.
         shared.wakeups.heard(Hint::Interrupt);
     }
-    shared.access.read_again(shared.store.as_ref()).await?;
-    Ok(meeting.time_ms)
+    Ok(if knows_all { meeting.time_ms } else { 0 })
+}
+
+/// Closes all connections while this coordinator cannot reach the database, if there were others. Clients go
+/// on at another one, which may reach it, before they lose their leases.
+async fn send_away(shared: &State, connections: &Connections, met: &watch::Sender<Instant>) {
+    let [longest, shortest] = AWAY_AFTER;
+    let patience = (Duration::from_millis(shared.lease_ms.into()) / 4).clamp(shortest, longest);
+    let mut is_away = false;
+    loop {
+        tokio::time::sleep(patience / 8).await;
+        let is_cut_off = met.borrow().elapsed() > patience && shared.members.load(Relaxed) > 1;
+        let closed = connections.close(is_cut_off);
+        if is_cut_off != is_away {
+            is_away = is_cut_off;
+            if is_away {
+                tracing::warn!(closed, "clients are sent to other coordinators: this one has no database");
+            } else {
+                tracing::info!("clients are admitted again");
+            }
+        }
+    }
 }
 
 /// Sends hints about the changes of this process.

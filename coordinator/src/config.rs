@@ -15,8 +15,8 @@ use crate::schedule::{Quota, Rules};
 pub struct CoordinatorConfig {
     /// Folder of jobs and blobs; created if missing. One process at a time. Default "fathom-data".
     pub data_dir: PathBuf,
-    /// URL of a PostgreSQL database for jobs, `postgres://USER@HOST:PORT/DATABASE`; the password may be in it,
-    /// in `PGPASSWORD` or in a password file. Default none: a store in `data_dir`.
+    /// URL of a PostgreSQL database for jobs, `postgres://USER@HOST:PORT/DATABASE`; the password may be in
+    /// it, in `PGPASSWORD` or in a password file. Default none: a store in `data_dir`.
     pub store: Option<String>,
     /// Maximum connections to that database. Default 32, at least 2.
     pub store_connections: u32,
@@ -24,6 +24,9 @@ pub struct CoordinatorConfig {
     /// `az://CONTAINER/PREFIX` or `file:///FOLDER`. Keys come from the environment variables of the provider,
     /// or from the role of the machine. Default none: `data_dir`.
     pub objects: Option<String>,
+    /// Whether workers and people may send files to a bucket and fetch them from there themselves, by URLs
+    /// that the coordinator signs for a minute. Default true.
+    pub direct_transfers: bool,
     /// Where to listen; port 0 takes a free one. Default 127.0.0.1:7420.
     pub listen: SocketAddr,
     /// Where to serve metrics and health over HTTP, neither encrypted nor authenticated; port 0 takes a free
@@ -100,6 +103,7 @@ impl Default for CoordinatorConfig {
             store: None,
             store_connections: 32,
             objects: None,
+            direct_transfers: true,
             listen: SocketAddr::from((Ipv4Addr::LOCALHOST, 7420)),
             metrics_listen: None,
             scaler_listen: None,

@@ -159,7 +159,10 @@ pub async fn serve(config: CoordinatorConfig) -> Result<Coordinator, Coordinator
     };
     let clock = Clock::start();
     data_dir::make(&config.data_dir)?;
-    let at = ObjectsAt::parse(config.objects.as_deref(), &config.data_dir)?;
+    let at = ObjectsAt::parse(config.objects.as_deref(), &config.data_dir)?.signed_by(|signing| {
+        let signing = if tls.is_some() { signing.with_tls() } else { signing };
+        config.direct_transfers.then_some(signing)
+    });
     let store = open_store(&config, &at).await?;
     at.hold_for(&store.deployment().await?, &config.data_dir).await?;
     let objects =
@@ -326,7 +329,7 @@ where
         }
     });
     if let Some(members) = shared.store.members() {
-        tokio::spawn(keep_in_touch(Arc::clone(&shared), members));
+        tokio::spawn(keep_in_touch(Arc::clone(&shared), members, Arc::clone(&connections)));
     }
     let guard = GuardLayer(Arc::new(guard));
     let incoming = connections.of(incoming);

@@ -291,6 +291,7 @@ impl From<ServiceError> for Status {
                 ObjectError::BadDigest(_) => (Code::InvalidArgument, "BAD_ARGUMENT"),
                 ObjectError::TooLarge { .. } => (Code::InvalidArgument, "BLOB_TOO_LARGE"),
                 ObjectError::NotFound(_) => (Code::NotFound, "BLOB_NOT_FOUND"),
+                ObjectError::NoUpload => (Code::NotFound, "UPLOAD_NOT_FOUND"),
                 ObjectError::WrongOffset { committed_bytes, .. } => {
                     metadata.insert("committed_size_bytes".into(), committed_bytes.to_string());
                     (Code::OutOfRange, "WRONG_OFFSET")

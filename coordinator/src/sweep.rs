@@ -56,7 +56,7 @@ pub async fn sweep_leases(shared: Arc<State>) -> Result<(), StoreError> {
                     let seconds = (Instant::now() - since).as_secs_f64();
                     tracing::warn!(
                         seconds,
-                        "the database is available again; leases were extended by one period"
+                        "the database is available again; leases were extended by one period unless another coordinator had it"
                     );
                 }
             }

@@ -11,8 +11,8 @@ use crate::access::{Access, Principal};
 use crate::clock::Clock;
 use crate::schedule::{Stage, Tenant, WorkerProfile};
 use crate::service_error::ServiceError;
-use crate::store::WorkerMark;
 use crate::store::members::SharedWorker;
+use crate::store::{StoreError, WorkerMark};
 
 /// Cache time of [`WorkerRegistry::peers`], milliseconds.
 const PEERS_FOR_MS: u64 = 200;
@@ -31,6 +31,20 @@ pub struct KnownWorker {
     pub seen_ms: u64,
     /// The caller that registered it, its only owner.
     pub owner: Principal,
+}
+
+impl KnownWorker {
+    /// Its owner in the rows that coordinators share.
+    pub fn owner_key(&self) -> &str {
+        self.owner.token_id.as_deref().unwrap_or_default()
+    }
+
+    /// It in the rows that coordinators share.
+    pub fn to_row(&self) -> Result<Vec<u8>, StoreError> {
+        let failed =
+            |error: serde_json::Error| StoreError::Unwritable { tree: "workers", message: error.to_string() };
+        serde_json::to_vec(self).map_err(failed)
+    }
 }
 
 /// All workers that this process knows of.
@@ -116,23 +130,28 @@ impl WorkerRegistry {
         seen.collect()
     }
 
-    /// Adds what other coordinators know of workers.
-    pub fn add_others(&self, others: Vec<SharedWorker>) {
+    /// Adds what other coordinators know of workers; returns whether all of them are known now. One that
+    /// another owner has registered meanwhile stays that of its first owner.
+    pub fn add_others(&self, others: Vec<SharedWorker>) -> bool {
         let now_ms = self.clock.now_ms();
+        let mut knows_all = true;
         let mut workers = self.workers.lock().unwrap_or_else(PoisonError::into_inner);
         for SharedWorker { incarnation, silent_ms, registered } in others {
             let seen_ms = now_ms.saturating_sub(silent_ms);
+            let has_row = registered.is_some();
             // One that a coordinator of another version cannot read has to register again.
             let new = registered.and_then(|row| serde_json::from_slice::<KnownWorker>(&row).ok());
             match (workers.get_mut(&incarnation), new) {
                 (Some(known), new) => {
                     let seen_ms = known.seen_ms.max(seen_ms);
+                    let new = new.filter(|new| new.owner.token_id == known.owner.token_id);
                     *known = KnownWorker { seen_ms, ..new.unwrap_or_else(|| known.clone()) };
                 }
                 (None, Some(new)) => drop(workers.insert(incarnation, KnownWorker { seen_ms, ..new })),
-                (None, None) => {}
+                (None, None) => knows_all &= has_row,
             }
         }
+        knows_all
     }
 
     /// Removes workers whose tokens are no longer valid, and returns their incarnations.

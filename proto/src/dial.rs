@@ -36,8 +36,9 @@ const ANSWER_WITHIN: Duration = Duration::from_secs(60);
 /// Calls that are answered only after the whole upload, which has no time limit.
 const SENDS_FIRST: [&str; 1] = ["WriteBlob"];
 /// Calls with a longer timeout, and its factor. They check every file of a scene on disk, up to two million,
-/// or read the whole store.
-const LOOKS_AT_EVERYTHING: [&str; 4] = ["BeginUpload", "CommitDataset", "CreateJob", "BackUpStore"];
+/// read the whole store, or hash a file in a bucket.
+const LOOKS_AT_EVERYTHING: [&str; 5] =
+    ["BeginUpload", "CommitDataset", "CreateJob", "BackUpStore", "FinishWrite"];
 const LONGER: u32 = 30;
 
 /// A connection that adds the token and a deadline to every call.

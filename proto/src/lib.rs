@@ -4,6 +4,7 @@
 #![allow(clippy::doc_lazy_continuation, reason = "prost indents the second line of a list item by one space")]
 
 pub mod dial;
+pub mod direct;
 
 /// Users: jobs and blobs.
 pub mod v1 {

@@ -72,6 +72,7 @@ async fn a_tenant_sees_nothing_of_another_whatever_it_asks() {
         digest: blob(POINTS).digest,
         offset_bytes: 0,
         job_id: job_id.to_owned(),
+        ..Default::default()
     };
     assert_eq!(said(wreck.uploads().read_blob(read("")).await), is(Code::NotFound, "BLOB_NOT_FOUND"));
     assert_eq!(said(wreck.uploads().read_blob(read(&job.job_id)).await), absent);

@@ -120,7 +120,7 @@ async fn a_revoked_token_ends_a_download_however_slowly_it_is_read() {
         .collect();
     owner.uploads().write_blob(futures::stream::iter(pieces)).await.unwrap();
     let (secret, token_id) = cluster.issue(Role::Viewer, "reef").await;
-    let request = || ReadBlobRequest { digest: whole.digest.clone(), offset_bytes: 0, job_id: String::new() };
+    let request = || ReadBlobRequest { digest: whole.digest.clone(), ..Default::default() };
     let thief = cluster.with(Some(&secret));
     let mut taken = thief.uploads().read_blob(request()).await.unwrap().into_inner();
     taken.next().await.unwrap().unwrap();
@@ -161,7 +161,7 @@ async fn waiting_downloads_delay_no_short_call_of_their_tenant() {
             let mut client = owner.uploads();
             let digest = whole.digest.clone();
             tokio::spawn(async move {
-                let request = ReadBlobRequest { digest, offset_bytes: 0, job_id: String::new() };
+                let request = ReadBlobRequest { digest, ..Default::default() };
                 let answer = client.read_blob(request).await;
                 std::future::pending::<()>().await;
                 drop(answer);

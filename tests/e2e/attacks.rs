@@ -256,7 +256,7 @@ async fn unread_downloads_cost_bounded_memory() {
             let mut client = client.clone();
             let digest = whole.digest.clone();
             held.push(tokio::spawn(async move {
-                let request = ReadBlobRequest { digest, offset_bytes: 0, job_id: String::new() };
+                let request = ReadBlobRequest { digest, ..Default::default() };
                 let answer = client.read_blob(request).await;
                 tokio::time::sleep(Duration::from_secs(600)).await;
                 drop(answer);

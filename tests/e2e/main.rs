@@ -6,6 +6,7 @@
 mod access;
 mod command_line;
 mod datasets;
+mod direct;
 mod drivers;
 #[cfg(unix)]
 mod faults;

@@ -48,7 +48,8 @@ fn two_coordinators_share_tokens_workers_quotas_and_logs() {
         let words = ["token", "issue", name, "--role", role, "--tenant", tenant];
         std::fs::write(path(name), succeed(&with(&words, &first, "operator"))).expect("written");
     }
-    let within = Duration::from_secs(3);
+    // It takes about a second where nothing else runs.
+    let within = Duration::from_secs(15);
     soon("the second one knows a token", within, || {
         output_of(&with(&["ls"], &second, "ana")).status.success()
     });
@@ -58,7 +59,7 @@ fn two_coordinators_share_tokens_workers_quotas_and_logs() {
     let flags = ["--token-file", &worker_token, "--cache-dir", &cache, "--name=reef-1"];
     let _worker = Service::worker_with(&[&["--coordinator", &second], &flags[..]].concat());
     let listed = |url: &str| json(&with(&["worker", "list", "--json"], url, "operator"));
-    soon("its worker is known", Duration::from_secs(20), || listed(&first)[0]["state"] == "active");
+    soon("its worker is known", Duration::from_secs(60), || listed(&first)[0]["state"] == "active");
     succeed(&with(&["worker", "cordon", "reef-1"], &first, "operator"));
     soon("the worker is cordoned", within, || listed(&second)[0]["state"] == "cordoned");
 
@@ -82,7 +83,7 @@ fn two_coordinators_share_tokens_workers_quotas_and_logs() {
     let ana = tokens.as_array().expect("tokens").iter().find(|token| token["name"] == "ana");
     let id = ana.expect("a token")["id"].as_str().expect("an id").to_owned();
     succeed(&with(&["token", "revoke", &id], &first, "operator"));
-    soon("the second one refuses a revoked token", Duration::from_secs(2), || {
+    soon("the second one refuses a revoked token", within, || {
         !output_of(&with(&["ls"], &second, "ana")).status.success()
     });
 

@@ -1,9 +1,11 @@
 //! Killed databases, buckets that fail, and coordinators whose jobs and files are in them.
 
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
+use crate::cut::Cut;
 use crate::harness::Harness;
-use crate::processes::can_train;
+use crate::processes::{can_train, output_of};
+use crate::reference;
 use crate::s3::Fault;
 
 #[test]
@@ -74,6 +76,37 @@ fn one_of_two_coordinators_is_killed_for_good() {
     let lines = harness.ask(&["logs", &job.id]);
     for task in ["plan", "partition-0000", "partition-0001", "merge"] {
         assert!(lines.contains(task), "the log lacks the lines of {task}: {lines}");
+    }
+    harness.check_data_dir();
+}
+
+#[test]
+fn a_coordinator_cut_off_from_its_database_sends_workers_on() {
+    let scenario = "a_coordinator_cut_off_from_its_database_sends_workers_on";
+    if !can_train(scenario) {
+        return;
+    }
+    let Some(mut harness) = Harness::on_database(scenario) else { return };
+    let (server, url) = harness.database();
+    let (network, url) = (Cut::to(server.folder()), url.clone());
+    harness.announce_second();
+    harness.start_second_at(Some(network.url(&url)));
+    let second = harness.second_url();
+    let addresses = format!("{second},{}", harness.url().split(',').next().expect("the first"));
+    harness.start_worker_at("far", &addresses, &reference::cache());
+    let job = harness.submit();
+    job.wait_for_checkpoint("partition-0000");
+    let before = harness.log_of("second").len();
+    network.set(true);
+    harness.succeeded(&job);
+    let log = harness.log_of("second");
+    assert!(log[before..].contains("clients are sent to other coordinators"), "{log}");
+
+    network.set(false);
+    let deadline = Instant::now() + Duration::from_secs(60);
+    while !output_of(&["ls", "--coordinator", &second]).status.success() {
+        assert!(Instant::now() < deadline, "it admits nobody:\n{}", harness.log_of("second"));
+        std::thread::sleep(Duration::from_millis(200));
     }
     harness.check_data_dir();
 }

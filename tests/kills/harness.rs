@@ -158,6 +158,14 @@ impl Harness {
 
     /// Starts the second coordinator.
     pub fn start_second(&mut self) {
+        let url = self.database.as_ref().map(|(_, url)| url.clone());
+        self.start_second_at(url);
+    }
+
+    /// The same with another way to the database.
+    pub fn start_second_at(&mut self, database: Option<String>) {
+        let of_first =
+            self.database.as_mut().zip(database).map(|((_, url), other)| std::mem::replace(url, other));
         let (port, _) = self.second.take().expect("it was announced");
         let (first_port, first_data) = (self.port, self.data.clone());
         let first = self.coordinator.take();
@@ -165,6 +173,20 @@ impl Harness {
         assert!(self.try_named("second"), "the second coordinator did not start");
         self.second = Some((port, self.coordinator.take()));
         (self.port, self.data, self.coordinator) = (first_port, first_data, first);
+        if let (Some((_, url)), Some(first)) = (&mut self.database, of_first) {
+            *url = first;
+        }
+    }
+
+    /// The address of the second coordinator.
+    pub fn second_url(&self) -> String {
+        let (port, _) = self.second.as_ref().expect("it was announced");
+        format!("http://127.0.0.1:{port}")
+    }
+
+    /// The server of its jobs, and their database.
+    pub fn database(&self) -> &(Server, String) {
+        self.database.as_ref().expect("a database")
     }
 
     /// As [`Harness::start_coordinator`], but may fail; returns whether it serves.

@@ -17,6 +17,7 @@ mod processes;
 
 mod clients;
 mod coordinators;
+mod cut;
 mod databases;
 mod disks;
 mod harness;

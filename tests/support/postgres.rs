@@ -118,6 +118,11 @@ impl Server {
         }
     }
 
+    /// The folder of its socket.
+    pub fn folder(&self) -> &Path {
+        self.dir.path()
+    }
+
     /// Creates a database; returns its URL.
     pub fn database(&self) -> String {
         let name = format!("test{}", self.databases.fetch_add(1, Ordering::Relaxed));

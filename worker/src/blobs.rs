@@ -8,6 +8,7 @@ use bytes::Bytes;
 use fathom_core::scene::BlobRef;
 use fathom_observe::threads;
 use fathom_proto::dial::{Connection, reason};
+use fathom_proto::direct::{Content, Direct};
 use fathom_proto::v1::upload_service_client::UploadServiceClient;
 use fathom_proto::{CHUNK_BYTES, v1};
 use tokio::sync::mpsc;
@@ -81,6 +82,7 @@ pub struct BlobClient {
     /// See [`BlobClient::of_job`].
     job_id: String,
     trouble: Trouble,
+    direct: Direct,
 }
 
 impl BlobClient {
@@ -90,12 +92,13 @@ impl BlobClient {
             client: UploadServiceClient::new(connection),
             job_id: String::new(),
             trouble: Trouble::default(),
+            direct: Direct::default(),
         }
     }
 
     /// For the blobs of the tenant that a job belongs to.
     pub fn of_job(&self, job_id: &str) -> Self {
-        Self { client: self.client.clone(), job_id: job_id.to_owned(), trouble: self.trouble.clone() }
+        Self { job_id: job_id.to_owned(), ..self.clone() }
     }
 
     /// The reason why calls are being retried.
@@ -142,8 +145,9 @@ impl BlobClient {
     pub async fn upload_as(&self, blob: &BlobRef, source: &BlobSource) -> Result<(), WorkerError> {
         let mut pauses = pauses();
         let mut repeated = Repeated::new("an upload", &self.trouble);
+        let mut may_be_direct = true;
         loop {
-            match self.try_upload(blob, source).await {
+            match self.try_upload(blob, source, &mut may_be_direct).await {
                 Ok(true) => {
                     repeated.answered();
                     return Ok(());
@@ -158,13 +162,28 @@ impl BlobClient {
         }
     }
 
-    /// One attempt: true if the blob is stored, false if the stream ended early.
-    async fn try_upload(&self, blob: &BlobRef, source: &BlobSource) -> Result<bool, Status> {
+    /// One attempt: true if the blob is stored, false if the stream ended early. At most one attempt sends it
+    /// to the bucket.
+    async fn try_upload(
+        &self,
+        blob: &BlobRef,
+        source: &BlobSource,
+        may_be_direct: &mut bool,
+    ) -> Result<bool, Status> {
         let mut client = self.client.clone();
         let query = v1::QueryBlobRequest { blob: Some(to_proto(blob)), job_id: self.job_id.clone() };
         let arrived = client.query_blob(query).await?.into_inner();
         if arrived.complete {
             return Ok(true);
+        }
+        if arrived.direct && std::mem::take(may_be_direct) && self.direct.is_wanted() {
+            let content = match source.clone() {
+                BlobSource::Bytes(bytes) => Content::Bytes(bytes),
+                BlobSource::File(path) => Content::File(path),
+            };
+            if self.direct.upload(&self.client, &to_proto(blob), &self.job_id, content).await {
+                return Ok(true);
+            }
         }
         let (sender, pieces) = mpsc::channel(PIECES_AHEAD);
         let (source, first, job_id) = (source.clone(), to_proto(blob), self.job_id.clone());
@@ -219,37 +238,62 @@ impl BlobClient {
     pub(crate) async fn download_part(&self, blob: &BlobRef, part: &Path) -> Result<(), WorkerError> {
         let mut pauses = pauses();
         let mut repeated = Repeated::new("a download", &self.trouble);
+        let (mut may_be_direct, mut was_direct) = (self.direct.is_wanted(), false);
         loop {
-            match self.try_download(blob, part).await {
-                Ok(()) => {
-                    repeated.answered();
-                    break;
+            match self.try_download(blob, part, may_be_direct, &mut was_direct).await {
+                Ok(()) => repeated.answered(),
+                Err(WorkerError::Bucket(error)) => {
+                    self.direct.failed(&error);
+                    may_be_direct = false;
+                    continue;
                 }
                 Err(WorkerError::Refused(status)) if will_pass(&status) => {
                     repeated.again(&status);
                     tokio::time::sleep(pauses.next().unwrap_or_default()).await;
+                    continue;
                 }
                 Err(error) => return Err(error),
             }
-        }
-        let hashed = part.to_owned();
-        let found = on_disk(move || hash_file(&hashed)).await?;
-        if found != *blob {
+            let hashed = part.to_owned();
+            let found = on_disk(move || hash_file(&hashed)).await?;
+            if found == *blob {
+                return Ok(());
+            }
             std::fs::remove_file(part).map_err(WorkerError::io("remove", part))?;
             let message = format!("received {} bytes with digest {}", found.bytes, found.digest);
-            return Err(WorkerError::Damaged { digest: blob.digest.clone(), message });
+            if !was_direct {
+                return Err(WorkerError::Damaged { digest: blob.digest.clone(), message });
+            }
+            // The coordinator looks at the blob when it sends it, and sets it aside if it is damaged.
+            tracing::warn!(
+                digest = blob.digest,
+                message,
+                "the bucket sent other bytes; asking the coordinator"
+            );
+            (may_be_direct, was_direct) = (false, false);
         }
-        Ok(())
     }
 
-    async fn try_download(&self, blob: &BlobRef, part: &Path) -> Result<(), WorkerError> {
+    /// Appends what is missing, and sets `was_direct` if it came from the bucket.
+    async fn try_download(
+        &self,
+        blob: &BlobRef,
+        part: &Path,
+        may_be_direct: bool,
+        was_direct: &mut bool,
+    ) -> Result<(), WorkerError> {
         let (path, most) = (part.to_owned(), blob.bytes);
         let (file, mut offset) =
             on_disk(move || open_part(&path, most).map_err(WorkerError::io("write", &path))).await?;
+        let write = |data: Bytes| {
+            let (file, path) = (Arc::clone(&file), part.to_owned());
+            on_disk(move || (&*file).write_all(&data).map_err(WorkerError::io("write", path)))
+        };
         let request = v1::ReadBlobRequest {
             digest: blob.digest.clone(),
             offset_bytes: offset,
             job_id: self.job_id.clone(),
+            direct: may_be_direct,
         };
         let mut pieces = self.client.clone().read_blob(request).await?.into_inner();
         while let Some(piece) = pieces.message().await? {
@@ -257,9 +301,20 @@ impl BlobClient {
                 let message = format!("byte {} where byte {offset} was expected", piece.offset_bytes);
                 return Err(WorkerError::Protocol(message));
             }
+            if !piece.url.is_empty() && !may_be_direct {
+                return Err(WorkerError::Protocol("a URL that nobody asked for".to_owned()));
+            }
+            if !piece.url.is_empty() {
+                *was_direct = true;
+                let missing = blob.bytes.saturating_sub(offset);
+                let mut pieces = self.direct.get(&piece.url, offset, missing).await?;
+                while let Some(data) = pieces.next().await? {
+                    write(data).await?;
+                }
+                return Ok(());
+            }
             offset += piece.data.len() as u64;
-            let (file, path) = (Arc::clone(&file), part.to_owned());
-            on_disk(move || (&*file).write_all(&piece.data).map_err(WorkerError::io("write", path))).await?;
+            write(piece.data).await?;
         }
         Ok(())
     }

@@ -39,6 +39,9 @@ pub enum WorkerError {
     /// The coordinator refused for good; a retry would not help.
     #[error("the coordinator refuses: {}", .0.message())]
     Refused(Box<Status>),
+    /// A transfer with the coordinator's bucket failed.
+    #[error(transparent)]
+    Bucket(#[from] fathom_proto::direct::DirectError),
     /// A received blob does not match its digest.
     #[error("blob {digest} arrived damaged: {message}")]
     Damaged {

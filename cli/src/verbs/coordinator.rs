@@ -48,6 +48,10 @@ pub struct CoordinatorSettings {
     /// as AWS_ACCESS_KEY_ID [default: the data folder]
     #[arg(long, value_name = "URL", env = "FATHOM_OBJECTS")]
     objects: Option<String>,
+    /// Let workers and people use the bucket themselves for large files, by URLs that are valid for a minute;
+    /// false sends all files through the coordinator
+    #[arg(long, num_args = 0..=1, default_missing_value = "true", require_equals = true, value_name = "BOOL", env = "FATHOM_DIRECT_TRANSFERS")]
+    direct_transfers: Option<bool>,
     /// Address or host name to listen on; beyond this machine it needs TLS and tokens; port 0 takes a free
     /// one
     #[arg(long, value_name = "ADDRESS:PORT", env = "FATHOM_LISTEN", value_parser = super::parse_address)]

@@ -37,7 +37,8 @@ impl RateLimit {
             return Ok(());
         }
         let per_second = self.per_second / f64::from(self.members.load(Relaxed).max(1));
-        let most = per_second * BURST_SECONDS;
+        // A share of less than one call would refuse every call.
+        let most = (per_second * BURST_SECONDS).max(1.0);
         let mut buckets = self.buckets.lock().unwrap_or_else(PoisonError::into_inner);
         // There is one bucket for each tenant with tokens, so callers cannot make the table grow.
         let bucket = buckets.entry(tenant.clone()).or_insert(Bucket { calls: most, filled_ms: now_ms });
@@ -74,6 +75,8 @@ mod tests {
         members.store(2, Relaxed);
         assert_eq!(taken("reef", 120_000), 10, "another coordinator allows the other half");
         assert_eq!(taken("reef", 121_000), 5);
+        members.store(100, Relaxed);
+        assert_eq!(taken("reef", 200_000), 1, "a small share refuses every call");
     }
 
     #[test]

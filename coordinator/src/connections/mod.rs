@@ -12,7 +12,7 @@
 mod accept;
 mod room;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 use std::io::{self, IoSlice};
 use std::net::SocketAddr;
 use std::pin::Pin;
@@ -48,6 +48,9 @@ pub struct Connections {
 struct All {
     next: u64,
     open: usize,
+    by_number: HashMap<u64, Weak<State>>,
+    /// Whether everybody is sent to other coordinators.
+    is_closed: bool,
     /// Strangers by the time of their last activity and a unique number, with their end time.
     strangers: BTreeMap<(Instant, u64), (Instant, Arc<State>)>,
     ended: Ended,
@@ -69,10 +72,27 @@ impl Connections {
         Arc::new(Self { room, all: Mutex::default() })
     }
 
-    /// Admits a connection as a stranger; `None` if there is no room, even without other strangers.
+    /// Closes all connections and admits no more, until it is called with false: clients go to the next
+    /// coordinator. Returns the number of those that it closed.
+    pub fn close(&self, is_closed: bool) -> usize {
+        let mut all = self.lock();
+        all.is_closed = is_closed;
+        if !is_closed {
+            return 0;
+        }
+        let open: Vec<Arc<State>> = all.by_number.drain().filter_map(|(_, state)| state.upgrade()).collect();
+        open.iter().for_each(|state| state.end(false));
+        open.len()
+    }
+
+    /// Admits a connection as a stranger; `None` if there is no room, even without other strangers, or if
+    /// everybody is sent away.
     pub fn enter<C>(self: &Arc<Self>, io: C, from: Option<SocketAddr>) -> Option<Connection<C>> {
         let now = Instant::now();
         let mut all = self.lock();
+        if all.is_closed {
+            return None;
+        }
         while all.strangers.len() >= self.room.strangers || all.open >= self.room.connections {
             let Some((_, (_, state))) = all.strangers.pop_first() else {
                 all.ended.crowded += 1;
@@ -96,6 +116,7 @@ impl Connections {
             is_uncounted: AtomicBool::new(false),
             wakers: [AtomicWaker::new(), AtomicWaker::new()],
         });
+        all.by_number.insert(state.number, Arc::downgrade(&state));
         all.strangers.insert((now, state.number), (now + FIRST_CALL_WITHIN, Arc::clone(&state)));
         Some(Connection { io, state })
     }
@@ -238,6 +259,7 @@ impl<C> Drop for Connection<C> {
         if let Some(heard) = heard {
             all.strangers.remove(&(heard, self.state.number));
         }
+        all.by_number.remove(&self.state.number);
         if !self.state.is_uncounted.load(Ordering::Acquire) {
             all.open = all.open.saturating_sub(1);
         }

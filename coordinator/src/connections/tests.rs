@@ -46,6 +46,25 @@ async fn calls_without_a_token_keep_a_connection_for_a_minute_each() {
 }
 
 #[tokio::test]
+async fn a_closed_coordinator_sends_everybody_away_until_it_opens() {
+    let connections = connections(10, 20);
+    let ((mut stranger, _a), (mut known, _b)) = (enter(&connections), enter(&connections));
+    known.connect_info().admit();
+    assert_eq!(connections.close(true), 2);
+    for connection in [&mut stranger, &mut known] {
+        assert_eq!(connection.read_u8().await.unwrap_err().kind(), io::ErrorKind::ConnectionAborted);
+    }
+    let (ours, _theirs) = duplex(64);
+    assert!(connections.enter(ours, None).is_none());
+    assert_eq!(connections.close(true), 0);
+    drop((stranger, known));
+    assert_eq!((connections.count(), connections.close(false)), ((0, 0), 0));
+    let (mut again, mut theirs) = enter(&connections);
+    theirs.write_u8(7).await.unwrap();
+    assert_eq!(again.read_u8().await.unwrap(), 7);
+}
+
+#[tokio::test]
 async fn one_stranger_too_many_ends_the_one_silent_for_longest() {
     let connections = connections(2, 20);
     let ((mut first, mut to_first), (mut second, _b)) = (enter(&connections), enter(&connections));

@@ -280,6 +280,10 @@ fn fuzzed_calls_of_uploads_are_answered_or_refused() {
     let mut corpus = corpus.to_vec();
     corpus.extend([(4, begin.encode_to_vec()), (4, by_list.encode_to_vec()), (5, wreck.clone())]);
     corpus.extend([(6, wreck.clone()), (7, page.encode_to_vec()), (8, wreck)]);
+    let sign = v1::SignWriteRequest { blob: blob(), job_id: String::new() };
+    let finish =
+        v1::FinishWriteRequest { blob: blob(), upload: blob().unwrap().digest, job_id: String::new() };
+    corpus.extend([(9, sign.encode_to_vec()), (10, finish.encode_to_vec())]);
     fuzz("calls of UploadService", &corpus, async |shared, which, bytes| {
         let uploads = Uploads(Arc::clone(shared));
         match which {
@@ -307,6 +311,9 @@ fn fuzzed_calls_of_uploads_are_answered_or_refused() {
             6 => uploads.get_dataset(message(bytes)?).await.ok().map(drop),
             7 => uploads.list_datasets(message(bytes)?).await.ok().map(drop),
             8 => uploads.delete_dataset(message(bytes)?).await.ok().map(drop),
+            9 => uploads.sign_write(message(bytes)?).await.ok().map(drop),
+            // Nothing is in a bucket here, so each of them is refused.
+            10 => uploads.finish_write(message(bytes)?).await.map_or_else(|_| Some(()), |_| None),
             _ => None,
         }
     });

@@ -72,7 +72,9 @@ fn fuzzed_messages_of_users_are_decoded_or_refused() {
     fuzz(v1::ListDatasetsRequest { page_size: 7, page_token: "reef/00000000".into() });
     fuzz(v1::DeleteDatasetRequest { dataset_id: "reef".into() });
     fuzz(v1::QueryBlobRequest { blob: blob(), job_id: job_id() });
-    fuzz(v1::ReadBlobRequest { digest: "0".repeat(64), offset_bytes: 3, job_id: job_id() });
+    fuzz(v1::SignWriteRequest { blob: blob(), job_id: job_id() });
+    fuzz(v1::FinishWriteRequest { blob: blob(), upload: "0".repeat(64), job_id: job_id() });
+    fuzz(v1::ReadBlobRequest { digest: "0".repeat(64), offset_bytes: 3, job_id: job_id(), direct: true });
 }
 
 #[test]
@@ -206,8 +208,13 @@ fn fuzzed_answers_of_a_coordinator_are_decoded_or_refused() {
     fuzz(v1::ListArtifactsResponse { artifacts: vec![artifact; 2], next_page_token: "2-0".into() });
     fuzz(v1::FindMissingBlobsResponse { missing: vec![blob().unwrap(); 2] });
     fuzz(v1::WriteBlobResponse { committed_size_bytes: 7, complete: true });
-    fuzz(v1::QueryBlobResponse { committed_size_bytes: 7, complete: true });
-    fuzz(v1::ReadBlobResponse { offset_bytes: 7, size_bytes: 9, data: vec![1, 2].into() });
+    fuzz(v1::QueryBlobResponse { committed_size_bytes: 7, complete: true, direct: true });
+    fuzz(v1::ReadBlobResponse {
+        offset_bytes: 7,
+        size_bytes: 9,
+        data: vec![1, 2].into(),
+        url: "http://reef/1".into(),
+    });
     fuzz(worker::RegisterResponse {
         lease_ms: 30_000,
         renew_every_ms: 7500,

@@ -44,6 +44,8 @@ pub struct Metrics {
     acknowledgement_seconds: Histogram,
     uploaded_bytes: Counter,
     served_bytes: Counter,
+    served_directly_bytes: Counter,
+    uploaded_directly_bytes: Counter,
     removed_blobs: Counter,
     removed_bytes: Counter,
     rpc: rpc::RpcMetrics,
@@ -88,6 +90,8 @@ impl Default for Metrics {
             acknowledgement_seconds,
             uploaded_bytes: Counter::default(),
             served_bytes: Counter::default(),
+            served_directly_bytes: Counter::default(),
+            uploaded_directly_bytes: Counter::default(),
             removed_blobs: Counter::default(),
             removed_bytes: Counter::default(),
             rpc: rpc::RpcMetrics::register(&mut registry),
@@ -148,6 +152,10 @@ impl Metrics {
             Unit::Bytes,
             self.served_bytes.clone(),
         );
+        let help = "Bytes for which clients and workers were given URLs of the bucket";
+        r.register_with_unit("served_directly", help, Unit::Bytes, self.served_directly_bytes.clone());
+        let help = "Bytes that clients and workers sent to the bucket themselves";
+        r.register_with_unit("uploaded_directly", help, Unit::Bytes, self.uploaded_directly_bytes.clone());
         r.register("blobs_removed", "Unreferenced blobs removed", self.removed_blobs.clone());
         let help = "Bytes of removed blobs and uploads";
         r.register_with_unit("removed", help, Unit::Bytes, self.removed_bytes.clone());
@@ -162,6 +170,16 @@ impl Metrics {
     /// Counts sent bytes.
     pub fn served(&self, bytes: usize) {
         self.served_bytes.inc_by(bytes as u64);
+    }
+
+    /// Counts bytes that a client fetches from the bucket itself.
+    pub fn served_directly(&self, bytes: u64) {
+        self.served_directly_bytes.inc_by(bytes);
+    }
+
+    /// Counts bytes that a client has sent to the bucket itself.
+    pub fn uploaded_directly(&self, bytes: u64) {
+        self.uploaded_directly_bytes.inc_by(bytes);
     }
 
     /// Counts the removals of a garbage collection.

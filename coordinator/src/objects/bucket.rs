@@ -152,8 +152,8 @@ impl Bucket {
         parts.complete().await
     }
 
-    /// Uploads a file as a blob, once its bytes have the blob's digest, and removes the file.
-    pub async fn adopt(&self, file: &Path, digest: &str) -> Result<(), ObjectError> {
+    /// Uploads a file as a blob, once its bytes have the blob's digest.
+    pub async fn put_file(&self, file: &Path, digest: &str) -> Result<(), ObjectError> {
         let path = object_path(digest)?;
         let owned = file.to_owned();
         let opened = spawn_io(file, move || {
@@ -183,9 +183,7 @@ impl Bucket {
             parts.abort().await;
             return Err(ObjectError::Damaged(digest.to_owned()));
         }
-        parts.complete().await?;
-        let owned = file.to_owned();
-        spawn_io(file, move || std::fs::remove_file(owned)).await
+        parts.complete().await
     }
 
     /// Makes the bytes of segments a blob. The bucket copies a single segment itself. Several are copied
@@ -326,6 +324,7 @@ impl Bucket {
             gone(of);
         };
         let is_old = |meta: &ObjectMeta| SystemTime::from(meta.last_modified) < before;
+        self.remove_unfinished().await?;
         for prefix in ["cas", "damaged"] {
             let old = self.list(prefix).try_filter(|meta| std::future::ready(is_old(meta)));
             let mut batches = old.try_chunks(REMOVED_AT_ONCE);
@@ -363,6 +362,19 @@ impl Bucket {
         asked.retain(|_, when| *when >= before);
         drop(asked);
         Ok(removed.into_inner().unwrap_or_else(PoisonError::into_inner))
+    }
+
+    /// Removes what clients sent here directly, and no coordinator has removed in time.
+    pub async fn remove_unfinished(&self) -> Result<(), ObjectError> {
+        let before = self.now().checked_sub(super::direct::UNFINISHED_FOR).unwrap_or(SystemTime::UNIX_EPOCH);
+        let is_old = |meta: &ObjectMeta| SystemTime::from(meta.last_modified) < before;
+        let old = self.list("direct").try_filter(|meta| std::future::ready(is_old(meta)));
+        let mut batches = old.try_chunks(REMOVED_AT_ONCE);
+        while let Some(batch) = batches.next().await {
+            let batch = batch.map_err(|failed| failed.1)?;
+            self.delete(batch.into_iter().map(|meta| meta.location).collect(), |_| ()).await?;
+        }
+        Ok(())
     }
 
     fn is_asked_since(&self, digest: &str, before: SystemTime) -> bool {

@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use object_store::RetryConfig;
-use object_store::aws::AmazonS3Builder;
+use object_store::aws::{AmazonS3, AmazonS3Builder};
 use object_store::prefix::PrefixStore;
 
 use super::bucket::PART_BYTES;
@@ -16,18 +16,24 @@ use crate::schedule::Tenant;
 const DAY: Duration = Duration::from_secs(86_400);
 const PREFIX: &str = "scenes";
 
-fn store_of(server: &S3Server, retries: RetryConfig) -> Arc<dyn ObjectStore> {
+fn s3_of(server: &S3Server, retries: RetryConfig) -> AmazonS3 {
     let mut builder = AmazonS3Builder::new().with_bucket_name(BUCKET).with_retry(retries);
     for (name, value) in server.environment() {
         let key = name.to_ascii_lowercase().parse().unwrap();
         builder = builder.with_config(key, value);
     }
     place::use_one_provider();
-    Arc::new(PrefixStore::new(builder.build().unwrap(), PREFIX))
+    builder.build().unwrap()
+}
+
+fn at_with(server: &S3Server, retries: RetryConfig) -> ObjectsAt {
+    let s3 = Arc::new(s3_of(server, retries));
+    let signing = Some(Signing::of_s3(Arc::clone(&s3), PREFIX.into()));
+    ObjectsAt::Bucket { url: server.url(PREFIX), store: Arc::new(PrefixStore::new(s3, PREFIX)), signing }
 }
 
 pub(super) fn at(server: &S3Server) -> ObjectsAt {
-    ObjectsAt::Bucket { url: server.url(PREFIX), store: store_of(server, place::retries()) }
+    at_with(server, place::retries())
 }
 
 /// The store of the default tenant, as after a start of the coordinator.
@@ -93,7 +99,7 @@ async fn blobs_small_and_large_arrive_and_are_read() {
     assert_eq!(rest, 0, "segments of complete uploads remain");
 }
 
-fn object_count(folder: &Path) -> usize {
+pub(super) fn object_count(folder: &Path) -> usize {
     let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
     entries.map(|entry| if entry.path().is_dir() { object_count(&entry.path()) } else { 1 }).sum()
 }
@@ -315,7 +321,7 @@ async fn faults_of_the_server_pass() {
 async fn an_outage_of_the_bucket_is_no_failed_attempt() {
     let (server, dir) = (S3Server::start(), tempfile::tempdir().unwrap());
     let once = RetryConfig { max_retries: 0, ..RetryConfig::default() };
-    let at = ObjectsAt::Bucket { url: server.url(PREFIX), store: store_of(&server, once) };
+    let at = at_with(&server, once);
     let blobs = TenantBlobs::open(at, dir.path(), 0, Clock::start(), None).await.unwrap();
     let store = blobs.of(&Tenant::default()).await.unwrap();
     let blob = store.put(Bytes::from_static(b"a result")).await.unwrap();

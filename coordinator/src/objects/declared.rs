@@ -6,6 +6,7 @@
 use std::collections::HashMap;
 use std::sync::PoisonError;
 
+use super::claim::Replaced;
 use super::{BlobStore, ObjectError};
 
 /// Bytes of incomplete uploads, by digest.
@@ -56,16 +57,19 @@ impl BlobStore {
         self.declared.lock().unwrap_or_else(PoisonError::into_inner).set(digest, bytes);
     }
 
-    /// The same for a new upload, unless the total would exceed `limit_bytes`.
+    /// The same for a new upload, unless the total would exceed `limit_bytes`. An upload that it replaces no
+    /// longer counts.
     pub(super) fn declare_within(
         &self,
         digest: &str,
         bytes: u64,
         limit_bytes: Option<u64>,
+        instead_of: Option<&str>,
     ) -> Result<(), ObjectError> {
         // One after the other: many that begin at once could exceed the limit together.
         let mut declared = self.declared.lock().unwrap_or_else(PoisonError::into_inner);
-        let before = declared.by_digest.get(digest).copied().unwrap_or(0);
+        let replaced = [Some(digest), instead_of].into_iter().flatten();
+        let before: u64 = replaced.filter_map(|digest| declared.by_digest.get(digest)).sum();
         let used_bytes = self.whole_bytes().saturating_add(declared.total - before);
         if let Some(limit_bytes) = limit_bytes
             && used_bytes.saturating_add(bytes) > limit_bytes
@@ -73,6 +77,17 @@ impl BlobStore {
             return Err(ObjectError::OverLimit { used_bytes, limit_bytes });
         }
         declared.set(digest, bytes);
+        if let Some(replaced) = instead_of {
+            declared.set(replaced, 0);
+        }
         Ok(())
+    }
+
+    /// Counts a direct upload again that another one replaced, if it is still signed.
+    pub(super) fn declare_again(&self, replaced: &Replaced) {
+        let signed = self.signed.lock().unwrap_or_else(PoisonError::into_inner);
+        if signed.contains_key(&replaced.upload) {
+            self.declare(&replaced.upload, replaced.bytes);
+        }
     }
 }

@@ -50,6 +50,9 @@ pub enum ObjectError {
     /// The work on an upload has ended early, after an error or at the end of the process.
     #[error("the upload was interrupted; call QueryBlob and continue it")]
     Interrupted,
+    /// An upload to the bucket of which nothing has arrived, or whose time is over.
+    #[error("nothing of this upload is in the bucket, or its time is over; send the blob with WriteBlob")]
+    NoUpload,
     /// Another stream writes this blob.
     #[error("blob {0} is being written by another stream; call QueryBlob and try again")]
     Busy(String),

@@ -7,8 +7,10 @@
 //! quarantined (`damaged.rs`) when a reader notices.
 
 mod bucket;
+mod claim;
 mod damaged;
 mod declared;
+mod direct;
 mod disk;
 mod error;
 mod garbage;
@@ -16,10 +18,11 @@ mod place;
 mod reader;
 mod segments;
 mod shared;
+mod signing;
 mod tenants;
 mod writer;
 
-use std::collections::HashSet;
+use std::collections::{HashMap, HashSet};
 use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -35,11 +38,14 @@ use object_store::{ObjectStore, ObjectStoreExt};
 use crate::clock::Clock;
 
 use bucket::Bucket;
+use claim::{Replaced, WriteClaim};
+use direct::Signed;
 use disk::{Disk, spawn_io};
 pub use error::ObjectError;
 pub use garbage::Removed;
 pub use place::ObjectsAt;
 use shared::SharedRows;
+pub use signing::{DIRECT_FROM_BYTES, SignedRequest, Signing};
 pub use tenants::TenantBlobs;
 pub use writer::BlobWriter;
 
@@ -54,6 +60,11 @@ pub struct BlobStore {
     place: Place,
     /// The rows of a bucket's blobs that several coordinators share; they count instead of the fields below.
     shared: Option<SharedRows>,
+    /// Signs requests with which clients use a bucket themselves.
+    signing: Option<Signing>,
+    /// Uploads that clients may send to the bucket themselves, by name.
+    signed: Mutex<HashMap<String, Signed>>,
+    finishes: direct::Finishes,
     min_free_bytes: u64,
     /// Clock for the age of files.
     clock: Clock,
@@ -96,9 +107,10 @@ impl BlobStore {
         staging: PathBuf,
         clock: Clock,
         shared: Option<SharedRows>,
+        signing: Option<Signing>,
     ) -> Result<Self, ObjectError> {
         let bucket = Arc::new(Bucket::open(store, staging, clock)?);
-        let store = Self { shared, ..Self::over(Place::Bucket(Arc::clone(&bucket)), 0, clock) };
+        let store = Self { shared, signing, ..Self::over(Place::Bucket(Arc::clone(&bucket)), 0, clock) };
         match &store.shared {
             Some(shared) => shared.fill(&bucket).await?,
             None => {
@@ -127,6 +139,9 @@ impl BlobStore {
         Self {
             place,
             shared: None,
+            signing: None,
+            signed: Mutex::default(),
+            finishes: direct::Finishes::default(),
             min_free_bytes,
             clock,
             writing: Mutex::default(),
@@ -326,14 +341,18 @@ impl BlobStore {
     pub async fn put(&self, bytes: Bytes) -> Result<BlobRef, ObjectError> {
         let digest = blake3::hash(&bytes).to_hex().to_string();
         let blob = BlobRef { digest, bytes: bytes.len() as u64 };
-        if !self.contains(&blob).await? {
-            match &self.place {
-                Place::Disk(disk) => disk.put(&blob.digest, bytes).await?,
-                Place::Bucket(bucket) => bucket.put(&blob.digest, bytes).await?,
-            }
-            self.count_whole(&blob).await?;
+        if self.contains(&blob).await? {
+            return Ok(blob);
         }
-        Ok(blob)
+        loop {
+            match &self.place {
+                Place::Disk(disk) => disk.put(&blob.digest, bytes.clone()).await?,
+                Place::Bucket(bucket) => bucket.put(&blob.digest, bytes.clone()).await?,
+            }
+            if self.count_whole(&blob).await? {
+                return Ok(blob);
+            }
+        }
     }
 
     /// The local folder of [`BlobStore::staging_path`].
@@ -355,22 +374,33 @@ impl BlobStore {
         let is_new = !self.contains(&blob).await?;
         let file = self.staging_path(name);
         match &self.place {
-            Place::Disk(disk) => disk.adopt(&file, &blob.digest).await?,
-            Place::Bucket(bucket) => bucket.adopt(&file, &blob.digest).await?,
-        }
-        if is_new {
-            self.count_whole(&blob).await?;
+            Place::Disk(disk) => {
+                disk.adopt(&file, &blob.digest).await?;
+                if is_new {
+                    self.count_whole(&blob).await?;
+                }
+            }
+            Place::Bucket(bucket) => {
+                let mut is_missing = is_new;
+                while is_missing {
+                    bucket.put_file(&file, &blob.digest).await?;
+                    is_missing = !self.count_whole(&blob).await?;
+                }
+                let owned = file.clone();
+                spawn_io(&file, move || std::fs::remove_file(owned)).await?;
+            }
         }
         Ok(blob)
     }
 
-    /// Counts a complete blob, which others see from now on.
-    async fn count_whole(&self, blob: &BlobRef) -> Result<(), ObjectError> {
-        match &self.shared {
-            Some(shared) => shared.publish(blob).await?,
-            None => drop(self.whole_bytes.fetch_add(blob.bytes, Ordering::Relaxed)),
+    /// Counts a complete blob, which others see from now on. False if garbage collection was removing an
+    /// earlier one: then its object has to be written again.
+    async fn count_whole(&self, blob: &BlobRef) -> Result<bool, ObjectError> {
+        if let (Place::Bucket(bucket), Some(shared)) = (&self.place, &self.shared) {
+            return shared.publish(bucket, blob).await;
         }
-        Ok(())
+        self.whole_bytes.fetch_add(blob.bytes, Ordering::Relaxed);
+        Ok(true)
     }
 
     /// Opens the upload of a blob at `offset`, which must equal the received bytes; `None` if the blob is
@@ -387,9 +417,27 @@ impl BlobStore {
     ) -> Result<Option<BlobWriter>, ObjectError> {
         check_digest(&blob.digest)?;
         let claim = WriteClaim::take(self, &blob.digest)?;
+        let replaced = self.signed_for(&blob.digest);
+        if self.admit(&claim, blob, offset, limit_bytes, replaced).await? {
+            BlobWriter::open(claim, blob.clone(), offset).await.map(Some)
+        } else {
+            Ok(None)
+        }
+    }
+
+    /// Whether an upload may begin or go on at `offset`; false if the blob is complete. From now on the
+    /// upload counts, instead of the one that it replaces.
+    async fn admit(
+        &self,
+        claim: &WriteClaim,
+        blob: &BlobRef,
+        offset: u64,
+        limit_bytes: Option<u64>,
+        replaced: Option<Replaced>,
+    ) -> Result<bool, ObjectError> {
         let (committed_bytes, complete) = self.committed(blob).await?;
         if complete {
-            return Ok(None);
+            return Ok(false);
         }
         if offset != committed_bytes {
             return Err(ObjectError::WrongOffset {
@@ -400,11 +448,26 @@ impl BlobStore {
         }
         self.check_space(blob.bytes.saturating_sub(offset)).await?;
         match &self.shared {
-            Some(shared) => shared.reserve(blob, limit_bytes).await?,
-            None => self.declare_within(&blob.digest, blob.bytes, limit_bytes)?,
+            Some(shared) => {
+                // First, so that the claim gives back what was reserved even if this caller leaves meanwhile.
+                claim.count(offset);
+                claim.replace(replaced.clone());
+                let instead_of = replaced.as_ref().map(|replaced| replaced.upload.as_str());
+                shared.reserve(blob, limit_bytes, instead_of).await?;
+                // From here on, garbage collection spares the blob. A removal that was under way has ended
+                // before the answer.
+                if self.contains(blob).await? {
+                    return Ok(false);
+                }
+            }
+            None => {
+                let instead_of = replaced.as_ref().map(|replaced| replaced.upload.as_str());
+                self.declare_within(&blob.digest, blob.bytes, limit_bytes, instead_of)?;
+                claim.count(offset);
+                claim.replace(replaced);
+            }
         }
-        claim.count(offset);
-        BlobWriter::open(claim, blob.clone(), offset).await.map(Some)
+        Ok(true)
     }
 
     /// Refuses if writing `bytes` more would leave too little free. A bucket is never full.
@@ -432,8 +495,9 @@ impl BlobStore {
             }
             Place::Bucket(bucket) => {
                 if let Some(shared) = &self.shared {
-                    let is_written = |digest: &str| self.is_written(digest);
-                    return shared.remove_unused(bucket, before, &used, is_written).await;
+                    let written = self.writing.lock().unwrap_or_else(PoisonError::into_inner).clone();
+                    let written: Vec<String> = written.into_iter().collect();
+                    return shared.remove_unused(bucket, before, &used, &written).await;
                 }
                 let gone = |gone: bucket::Gone<'_>| match gone {
                     bucket::Gone::Blob { bytes } => self.count_removed(bytes),
@@ -472,61 +536,6 @@ async fn free_bytes(path: &Path) -> Result<u64, ObjectError> {
     spawn_io(path, move || disk::free_bytes(&owned)).await
 }
 
-/// The exclusive right to write one blob; returned when dropped.
-struct WriteClaim {
-    store: Arc<BlobStore>,
-    digest: String,
-    /// Received bytes; `None` until the upload counts.
-    arrived_bytes: Mutex<Option<u64>>,
-}
-
-impl WriteClaim {
-    fn take(store: &Arc<BlobStore>, digest: &str) -> Result<Self, ObjectError> {
-        let mut writing = store.writing.lock().unwrap_or_else(PoisonError::into_inner);
-        if writing.insert(digest.to_owned()) {
-            Ok(Self { store: Arc::clone(store), digest: digest.to_owned(), arrived_bytes: Mutex::default() })
-        } else {
-            Err(ObjectError::Busy(digest.to_owned()))
-        }
-    }
-
-    /// Bytes that count when the writer ends.
-    fn count(&self, arrived_bytes: u64) {
-        *self.arrived_bytes.lock().unwrap_or_else(PoisonError::into_inner) = Some(arrived_bytes);
-    }
-
-    /// The upload is complete: its blob counts.
-    async fn complete(&self, bytes: u64) -> Result<(), ObjectError> {
-        self.store.count_whole(&BlobRef { digest: self.digest.clone(), bytes }).await?;
-        // A shared row of the upload has ended with the blob's.
-        let ended = self.store.shared.is_none().then_some(0);
-        *self.arrived_bytes.lock().unwrap_or_else(PoisonError::into_inner) = ended;
-        Ok(())
-    }
-
-    /// Counts what has arrived in the shared rows, before another coordinator goes on.
-    async fn settle(&self) {
-        let Some(shared) = &self.store.shared else { return };
-        let arrived = self.arrived_bytes.lock().unwrap_or_else(PoisonError::into_inner).take();
-        let Some(bytes) = arrived else { return };
-        if let Err(error) = shared.leave(&self.digest, bytes).await {
-            let digest = &self.digest;
-            tracing::warn!(%error, digest, "an upload counts too much until the next garbage collection");
-        }
-    }
-}
-
-impl Drop for WriteClaim {
-    fn drop(&mut self) {
-        // Before another stream may write it. The rows were settled by the upload's task.
-        let arrived = *self.arrived_bytes.get_mut().unwrap_or_else(PoisonError::into_inner);
-        if let Some(bytes) = arrived.filter(|_| self.store.shared.is_none()) {
-            self.store.declare(&self.digest, bytes);
-        }
-        self.store.writing.lock().unwrap_or_else(PoisonError::into_inner).remove(&self.digest);
-    }
-}
-
 /// This also keeps `..` and `/` out of every path made from a digest.
 fn check_digest(digest: &str) -> Result<(), ObjectError> {
     let is_hex = |b: u8| b.is_ascii_digit() || (b'a'..=b'f').contains(&b);
@@ -549,6 +558,8 @@ fn io_error(action: &'static str, path: &Path) -> impl FnOnce(io::Error) -> Obje
 
 #[cfg(test)]
 mod bucket_tests;
+#[cfg(test)]
+mod direct_tests;
 #[cfg(test)]
 #[path = "../../../tests/support/s3.rs"]
 pub(crate) mod s3_server;

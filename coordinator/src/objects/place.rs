@@ -10,12 +10,13 @@ use object_store::gcp::GoogleCloudStorageBuilder;
 use object_store::local::LocalFileSystem;
 use object_store::path::Path as ObjectPath;
 use object_store::prefix::PrefixStore;
+use object_store::signer::Signer;
 use object_store::{
     BackoffConfig, ObjectStore, ObjectStoreExt, ObjectStoreScheme, PutMode, PutOptions, RetryConfig,
 };
 use url::Url;
 
-use super::{ObjectError, io_error};
+use super::{ObjectError, Signing, io_error};
 
 /// Names the deployment whose files are in a bucket.
 const MARKER: &str = "fathom-deployment";
@@ -33,6 +34,8 @@ pub enum ObjectsAt {
         url: String,
         /// The objects under the URL.
         store: Arc<dyn ObjectStore>,
+        /// Signs URLs of these objects for clients; `None` if clients get everything from the coordinator.
+        signing: Option<Signing>,
     },
 }
 
@@ -58,29 +61,41 @@ impl ObjectsAt {
         let (scheme, prefix) = ObjectStoreScheme::parse(&url).map_err(|error| refuse(error.to_string()))?;
         use_one_provider();
         let failed = |error: object_store::Error| refuse(error.to_string());
-        let store: Arc<dyn ObjectStore> = match scheme {
+        let (store, signing): (Arc<dyn ObjectStore>, Signing) = match scheme {
             ObjectStoreScheme::Local => {
                 let folder = url.to_file_path();
                 return folder.map(Self::Folder).map_err(|()| refuse("it names no folder".to_owned()));
             }
             ObjectStoreScheme::AmazonS3 => {
                 let builder = AmazonS3Builder::from_env().with_url(text).with_retry(retries());
-                Arc::new(builder.build().map_err(failed)?)
+                let s3 = Arc::new(builder.build().map_err(failed)?);
+                (Arc::clone(&s3) as _, Signing::of_s3(s3, prefix.clone()))
             }
             ObjectStoreScheme::GoogleCloudStorage => {
                 let builder = GoogleCloudStorageBuilder::from_env().with_url(text).with_retry(retries());
-                Arc::new(builder.build().map_err(failed)?)
+                both(builder.build().map_err(failed)?, &prefix)
             }
             ObjectStoreScheme::MicrosoftAzure => {
                 let builder = MicrosoftAzureBuilder::from_env().with_url(text).with_retry(retries());
-                Arc::new(builder.build().map_err(failed)?)
+                both(builder.build().map_err(failed)?, &prefix)
             }
             _ => {
                 let message = "it must begin with file://, s3://, gs:// or az://";
                 return Err(refuse(message.to_owned()));
             }
         };
-        Ok(Self::Bucket { url: text.to_owned(), store: Arc::new(PrefixStore::new(store, prefix)) })
+        let store = Arc::new(PrefixStore::new(store, prefix));
+        Ok(Self::Bucket { url: text.to_owned(), store, signing: Some(signing) })
+    }
+
+    /// The same, whose URLs `change` signs, or nobody.
+    pub fn signed_by(self, change: impl FnOnce(Signing) -> Option<Signing>) -> Self {
+        match self {
+            Self::Bucket { url, store, signing } => {
+                Self::Bucket { url, store, signing: signing.and_then(change) }
+            }
+            folder => folder,
+        }
     }
 
     /// Takes a bucket, or a folder beside `data_dir`, for a deployment, whose name is written there once.
@@ -103,7 +118,7 @@ impl ObjectsAt {
                 let store = LocalFileSystem::new_with_prefix(folder)?.with_fsync(true);
                 hold(&store, &name, deployment).await
             }
-            Self::Bucket { url, store } => hold(store.as_ref(), url, deployment).await,
+            Self::Bucket { url, store, .. } => hold(store.as_ref(), url, deployment).await,
         }
     }
 
@@ -119,6 +134,11 @@ impl ObjectsAt {
             }
         }
     }
+}
+
+fn both<T: ObjectStore + Signer>(store: T, prefix: &ObjectPath) -> (Arc<dyn ObjectStore>, Signing) {
+    let store = Arc::new(store);
+    (Arc::clone(&store) as _, Signing::new(store, prefix.clone()))
 }
 
 fn is_same_folder(one: &Path, other: &Path) -> bool {

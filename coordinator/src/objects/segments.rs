@@ -66,6 +66,13 @@ fn longest_run(by_offset: BTreeMap<u64, Vec<Segment>>) -> Vec<Segment> {
     run
 }
 
+/// The path of a new segment.
+pub(super) fn path_at(digest: &str, offset: u64) -> ObjectPath {
+    // Two streams at one offset, of two coordinators, write two objects.
+    let random = Uuid::new_v4().simple().to_string();
+    ObjectPath::from_iter(["uploads", digest, &format!("{offset}-{}", &random[..12])])
+}
+
 /// Received bytes of an upload.
 pub(super) async fn arrived_bytes(bucket: &Bucket, digest: &str) -> Result<u64, ObjectError> {
     Ok(arrived(bucket, digest).await?.iter().map(|segment| segment.bytes).sum())
@@ -216,10 +223,7 @@ impl Upload {
     }
 
     fn segment_path(&self) -> ObjectPath {
-        // Two streams at one offset, of two coordinators, write two objects.
-        let random = Uuid::new_v4().simple().to_string();
-        let name = format!("{}-{}", self.durable_bytes(), &random[..12]);
-        ObjectPath::from_iter(["uploads", &self.claim.digest, &name])
+        path_at(&self.claim.digest, self.durable_bytes())
     }
 
     async fn save(&mut self) -> Result<(), ObjectError> {
@@ -249,14 +253,23 @@ impl Upload {
     async fn publish(&mut self) -> Result<(), ObjectError> {
         if self.complete.is_empty() && self.current.is_none() {
             let whole: Vec<u8> = self.waiting.take().concat();
-            self.bucket.put(&self.claim.digest, whole.into()).await?;
-            return self.claim.complete(self.bytes).await;
+            let whole = Bytes::from(whole);
+            loop {
+                self.bucket.put(&self.claim.digest, whole.clone()).await?;
+                if self.claim.complete(self.bytes).await? {
+                    return Ok(());
+                }
+            }
         }
         self.save().await?;
         let paths: Vec<ObjectPath> = self.complete.drain(..).map(|segment| segment.path).collect();
-        self.bucket.publish(&self.claim.digest, self.bytes, &paths).await?;
-        // Before the segments go: after a crash here, the client need not send it again.
-        self.claim.complete(self.bytes).await?;
+        loop {
+            self.bucket.publish(&self.claim.digest, self.bytes, &paths).await?;
+            // Before the segments go: after a crash here, the client need not send it again.
+            if self.claim.complete(self.bytes).await? {
+                break;
+            }
+        }
         // Garbage collection finds what stays here.
         if let Err(error) = self.bucket.delete(paths, |_| ()).await {
             let digest = &self.claim.digest;
@@ -271,8 +284,10 @@ impl Upload {
             current.parts.abort().await;
         }
         self.complete.clear();
-        let paths = arrived(&self.bucket, &self.claim.digest).await?;
-        self.bucket.delete(paths.into_iter().map(|segment| segment.path).collect(), |_| ()).await?;
+        // Also what two coordinators received at one offset, of which only one counts as arrived.
+        let listed = self.bucket.list(&format!("uploads/{}", self.claim.digest));
+        let paths = listed.map_ok(|meta| meta.location).try_collect().await?;
+        self.bucket.delete(paths, |_| ()).await?;
         self.claim.count(0);
         Ok(())
     }

@@ -13,12 +13,13 @@ use fathom_core::scene::BlobRef;
 use futures::{StreamExt, TryStreamExt};
 use object_store::ObjectMeta;
 use object_store::path::Path as ObjectPath;
+use tokio::time::Instant;
 
 use super::bucket::{Bucket, digest_of_segment};
 use super::garbage::Removed;
 use super::{ObjectError, check_digest, object_path};
 use crate::schedule::Tenant;
-use crate::store::ledger::{Known, Ledger, REMOVAL_WITHIN, Reserved, UsedBlob};
+use crate::store::ledger::{Known, Ledger, REMOVAL_WITHIN, Removal, Reserved, UsedBlob};
 
 /// Rows that are read or asked for at a time.
 const ROWS_AT_ONCE: usize = 1000;
@@ -48,13 +49,11 @@ impl SharedRows {
         if self.ledger.is_filled(&self.tenant).await? {
             return Ok(());
         }
-        self.add_orphans(bucket, bucket.now() + 2 * ORPHAN_AFTER).await?;
+        self.add_found(bucket, None).await?;
         for (digest, segments) in bucket.uploads().await? {
             let bytes = segments.iter().map(|segment| segment.size).sum();
             if check_digest(&digest).is_ok() {
-                let blob = BlobRef { digest, bytes };
-                self.ledger.reserve(&self.tenant, &blob, None).await?;
-                self.ledger.leave(&self.tenant, &blob.digest, bytes).await?;
+                self.ledger.add_upload(&self.tenant, &BlobRef { digest, bytes }).await?;
             }
         }
         Ok(self.ledger.set_filled(&self.tenant).await?)
@@ -75,7 +74,7 @@ impl SharedRows {
         Ok(lengths)
     }
 
-    /// Waits for the end of a removal.
+    /// Waits for the end of a removal, and ends a late one by what is in the bucket.
     async fn length(
         &self,
         bucket: &Bucket,
@@ -87,19 +86,29 @@ impl SharedRows {
                 Known::There { bytes } => return Ok(Some(bytes)),
                 Known::Missing => return Ok(None),
                 Known::Going { is_late: false } => tokio::time::sleep(LOOK_EVERY).await,
-                Known::Going { is_late: true } => match bucket.head(&object_path(digest)?).await? {
-                    Some(_) => self.ledger.keep(&self.tenant, digest).await?,
-                    None => self.ledger.removed(&self.tenant, &[digest.to_owned()]).await?,
-                },
+                Known::Going { is_late: true } => {
+                    // Several callers may find it late; the one that announces it again ends it.
+                    if let Some(removal) = self.announce(digest).await? {
+                        match bucket.head(&object_path(digest)?).await? {
+                            Some(_) => self.ledger.keep(&self.tenant, &removal).await?,
+                            None => self.ledger.removed(&self.tenant, &[removal]).await?,
+                        }
+                    }
+                }
             }
             let again = self.ledger.ask(&self.tenant, &[digest]).await?;
             known = again.first().copied().unwrap_or(Known::Missing);
         }
     }
 
-    /// Begins an upload, unless it would exceed the limit.
-    pub async fn reserve(&self, blob: &BlobRef, limit_bytes: Option<u64>) -> Result<(), ObjectError> {
-        match self.ledger.reserve(&self.tenant, blob, limit_bytes).await? {
+    /// Begins an upload, unless it would exceed the limit. An upload that it replaces no longer counts.
+    pub async fn reserve(
+        &self,
+        blob: &BlobRef,
+        limit_bytes: Option<u64>,
+        instead_of: Option<&str>,
+    ) -> Result<(), ObjectError> {
+        match self.ledger.reserve(&self.tenant, blob, limit_bytes, instead_of).await? {
             Reserved::Counts => Ok(()),
             Reserved::OverLimit { used_bytes } => {
                 Err(ObjectError::OverLimit { used_bytes, limit_bytes: limit_bytes.unwrap_or(0) })
@@ -112,9 +121,14 @@ impl SharedRows {
         Ok(self.ledger.leave(&self.tenant, digest, bytes).await?)
     }
 
-    /// See [`Ledger::publish`].
-    pub async fn publish(&self, blob: &BlobRef) -> Result<(), ObjectError> {
-        Ok(self.ledger.publish(&self.tenant, blob).await?)
+    /// Records a blob whose object is complete. False if the blob was being removed: the caller has to write
+    /// the object again.
+    pub async fn publish(&self, bucket: &Bucket, blob: &BlobRef) -> Result<bool, ObjectError> {
+        if self.ledger.publish(&self.tenant, blob).await? {
+            return Ok(true);
+        }
+        self.ask(bucket, &[&blob.digest]).await?;
+        Ok(false)
     }
 
     /// Bytes of all blobs and uploads.
@@ -134,16 +148,21 @@ impl SharedRows {
         digest: &str,
         remove: impl Future<Output = Result<bool, ObjectError>>,
     ) -> Result<bool, ObjectError> {
-        let digests = [digest.to_owned()];
-        if self.ledger.condemn(&self.tenant, &digests, None).await?.is_empty() {
-            return Ok(false);
-        }
+        let deadline = Instant::now() + REMOVAL_WITHIN / 2;
+        let Some(removal) = self.announce(digest).await? else { return Ok(false) };
         // On an error, the removal becomes late, and the next one that asks looks at the object.
-        let is_removed = in_time(remove).await?;
+        let is_removed = until(deadline, remove).await?;
         if is_removed {
-            self.ledger.removed(&self.tenant, &digests).await?;
+            self.ledger.removed(&self.tenant, &[removal]).await?;
+        } else {
+            self.ledger.keep(&self.tenant, &removal).await?;
         }
         Ok(is_removed)
+    }
+
+    /// Announces the removal of one blob, unless somebody else removes it.
+    async fn announce(&self, digest: &str) -> Result<Option<Removal>, ObjectError> {
+        Ok(self.ledger.condemn(&self.tenant, &[digest.to_owned()], None).await?.pop())
     }
 
     /// Removes the row of a blob whose object does not exist.
@@ -156,18 +175,22 @@ impl SharedRows {
     }
 
     /// Removes blobs and uploads that were last used or written before `before`, except the blobs `used`.
-    /// `is_written`: by a stream of this process.
+    /// Streams of this process write the blobs `written`.
     pub async fn remove_unused(
         &self,
         bucket: &Bucket,
         before: SystemTime,
         used: &HashSet<String>,
-        is_written: impl Fn(&str) -> bool,
+        written: &[String],
     ) -> Result<Removed, ObjectError> {
         let now = bucket.now();
-        self.add_orphans(bucket, now).await?;
+        self.ledger.close_uploads(&self.tenant, written).await?;
+        // A coordinator died between object and row.
+        let young = now.checked_sub(ORPHAN_AFTER).unwrap_or(SystemTime::UNIX_EPOCH);
+        self.add_found(bucket, Some(young)).await?;
+        bucket.remove_unfinished().await?;
         let mut removed = self.remove_blobs(bucket, before, used).await?;
-        removed = removed.and(self.remove_uploads(bucket, now, before, is_written).await?);
+        removed = removed.and(self.remove_uploads(bucket, now, before).await?);
         Ok(removed.and(bucket.remove_damaged(before).await?))
     }
 
@@ -186,20 +209,23 @@ impl SharedRows {
             let unused: Vec<String> =
                 page.into_iter().map(|blob| blob.digest).filter(|digest| !used.contains(digest)).collect();
             for some in unused.chunks(REMOVED_AT_ONCE) {
-                let going = self.ledger.condemn(&self.tenant, some, Some(before_ms)).await?;
-                let paths = going.iter().map(|blob| object_path(&blob.digest)).collect::<Result<_, _>>()?;
-                let gone = Mutex::new(Vec::new());
+                let deadline = Instant::now() + REMOVAL_WITHIN / 2;
+                let mut going = self.ledger.condemn(&self.tenant, some, Some(before_ms)).await?;
+                let paths = going
+                    .iter()
+                    .map(|removal| object_path(&removal.blob.digest))
+                    .collect::<Result<_, _>>()?;
+                let gone = Mutex::new(HashSet::new());
                 let note = |path: &ObjectPath| {
                     let digest = path.filename().unwrap_or_default().to_owned();
-                    gone.lock().unwrap_or_else(PoisonError::into_inner).push(digest);
+                    gone.lock().unwrap_or_else(PoisonError::into_inner).insert(digest);
                 };
-                let deleted = in_time(bucket.delete(paths, note)).await;
+                let deleted = until(deadline, bucket.delete(paths, note)).await;
                 let gone = gone.into_inner().unwrap_or_else(PoisonError::into_inner);
-                self.ledger.removed(&self.tenant, &gone).await?;
-                let bytes: BTreeMap<&str, u64> =
-                    going.iter().map(|blob| (blob.digest.as_str(), blob.bytes)).collect();
-                removed.blobs += gone.len() as u64;
-                removed.bytes += gone.iter().filter_map(|digest| bytes.get(digest.as_str())).sum::<u64>();
+                going.retain(|removal| gone.contains(&removal.blob.digest));
+                self.ledger.removed(&self.tenant, &going).await?;
+                removed.blobs += going.len() as u64;
+                removed.bytes += going.iter().map(|removal| removal.blob.bytes).sum::<u64>();
                 deleted?;
             }
         }
@@ -211,7 +237,6 @@ impl SharedRows {
         bucket: &Bucket,
         now: SystemTime,
         before: SystemTime,
-        is_written: impl Fn(&str) -> bool,
     ) -> Result<Removed, ObjectError> {
         let settled_ms = unix_ms(now.checked_sub(SETTLED_FOR).unwrap_or(SystemTime::UNIX_EPOCH));
         let left = self.ledger.left_uploads(&self.tenant, settled_ms).await?;
@@ -227,9 +252,7 @@ impl SharedRows {
         let is_old = |meta: &ObjectMeta| SystemTime::from(meta.last_modified) < before;
         let old: Vec<String> = uploads
             .iter()
-            .filter(|(digest, segments)| {
-                segments.iter().all(is_old) && !written.contains(*digest) && !is_written(digest)
-            })
+            .filter(|(digest, segments)| segments.iter().all(is_old) && !written.contains(*digest))
             .map(|(digest, _)| digest.clone())
             .collect();
         for digest in old {
@@ -248,28 +271,36 @@ impl SharedRows {
         Ok(removed)
     }
 
-    /// Adds rows for objects without one: a coordinator died between the two, or the database is new.
-    async fn add_orphans(&self, bucket: &Bucket, now: SystemTime) -> Result<(), ObjectError> {
-        let young = now.checked_sub(ORPHAN_AFTER).unwrap_or(SystemTime::UNIX_EPOCH);
+    /// Adds rows for objects without one: all, or those last written before `before`. Another coordinator may
+    /// delete an object after it was listed here, so those of a database in use are looked at again.
+    async fn add_found(&self, bucket: &Bucket, before: Option<SystemTime>) -> Result<(), ObjectError> {
         let listed = bucket.list("cas").try_filter_map(move |meta| {
             let used = SystemTime::from(meta.last_modified);
             let digest = meta.location.filename().unwrap_or_default().to_owned();
-            let is_blob = used < young && check_digest(&digest).is_ok();
+            let is_blob = before.is_none_or(|before| used < before) && check_digest(&digest).is_ok();
             let blob = BlobRef { digest, bytes: meta.size };
             std::future::ready(Ok(is_blob.then(|| UsedBlob { blob, used_ms: unix_ms(used) })))
         });
         let mut pages = listed.try_chunks(ROWS_AT_ONCE);
         while let Some(page) = pages.next().await {
-            self.ledger.add(&self.tenant, &page.map_err(|failed| failed.1)?).await?;
+            self.ledger.add(&self.tenant, &page.map_err(|failed| failed.1)?, before.is_none()).await?;
         }
         Ok(())
     }
 }
 
-/// Runs the deletions of a removal, with time left for others to notice that they have ended.
-async fn in_time<T>(work: impl Future<Output = Result<T, ObjectError>>) -> Result<T, ObjectError> {
-    let late = |_| ObjectError::Late { seconds: (REMOVAL_WITHIN / 2).as_secs() };
-    tokio::time::timeout(REMOVAL_WITHIN / 2, work).await.map_err(late)?
+/// Runs the deletions of a removal. Its deadline is counted from before the announcement, and leaves time in
+/// which requests that are under way end.
+async fn until<T>(
+    deadline: Instant,
+    work: impl Future<Output = Result<T, ObjectError>>,
+) -> Result<T, ObjectError> {
+    let late = || ObjectError::Late { seconds: (REMOVAL_WITHIN / 2).as_secs() };
+    // This process may have been suspended since.
+    if Instant::now() >= deadline {
+        return Err(late());
+    }
+    tokio::time::timeout_at(deadline, work).await.map_err(|_| late())?
 }
 
 fn unix_ms(time: SystemTime) -> u64 {

@@ -5,10 +5,12 @@ use std::time::{Duration, SystemTime};
 use sqlx::{Connection as _, PgConnection};
 
 use super::bucket_tests::{at, content, key, objects, send};
+use super::direct_tests::{sent, signed, until_empty};
 use super::s3_server::{S3Server, age};
 use super::*;
 use crate::schedule::{Rules, Tenant};
 use crate::store::conformance::postgres_server::database;
+use crate::store::ledger::UsedBlob;
 use crate::store::{PostgresOptions, PostgresStore, Store as _};
 
 const DAY: Duration = Duration::from_secs(86_400);
@@ -57,6 +59,39 @@ impl Place {
         let row = format!("WHERE digest = decode('{}', 'hex')", blob.digest);
         self.sql(&format!("UPDATE blobs SET used_ms = used_ms - 172800000 {row}")).await;
     }
+}
+
+#[tokio::test]
+async fn what_one_coordinator_signs_another_finishes() {
+    let Some(place) = Place::new() else { return };
+    let [one, other] = [place.coordinator().await, place.coordinator().await];
+    let content = content(300_000);
+    let blob = BlobRef::of(&content);
+    let write = signed(&one.blobs, &blob).await;
+    assert_eq!(other.blobs.used_bytes().await.unwrap(), blob.bytes, "it counts from then on");
+    sent(&write, &content).await.unwrap();
+    other.blobs.finish_write(&blob, &write.upload, None).await.unwrap();
+    assert!(one.blobs.read(&blob).await.unwrap() == content);
+    until_empty(&objects(&place.server, "direct")).await;
+
+    assert_eq!(one.blobs.used_bytes().await.unwrap(), blob.bytes, "it counts twice");
+
+    // A limit does not count it twice, wherever it is finished.
+    let next = BlobRef::of(&[7; 300_000]);
+    let limit = Some(2 * blob.bytes);
+    let write = one.blobs.sign_write(&next, limit).await.unwrap().unwrap();
+    sent(&write, &[7; 300_000]).await.unwrap();
+    other.blobs.finish_write(&next, &write.upload, limit).await.unwrap();
+    assert!(other.blobs.contains(&next).await.unwrap());
+    assert_eq!(one.blobs.used_bytes().await.unwrap(), 2 * blob.bytes);
+
+    // What the other one refuses counts as long as it may be sent again.
+    let wrong = BlobRef::of(&[8; 300_000]);
+    let write = signed(&one.blobs, &wrong).await;
+    sent(&write, &[9; 300_000]).await.unwrap();
+    let refused = other.blobs.finish_write(&wrong, &write.upload, None).await.unwrap_err();
+    assert!(matches!(refused, ObjectError::DigestMismatch { .. }), "{refused}");
+    assert_eq!(one.blobs.used_bytes().await.unwrap(), 3 * blob.bytes);
 }
 
 #[tokio::test]
@@ -193,6 +228,13 @@ async fn what_a_dead_coordinator_left_half_done_is_put_right() {
     one.blobs.remove_unused(SystemTime::now() - DAY, HashSet::new()).await.unwrap();
     assert_eq!(one.blobs.used_bytes().await.unwrap(), 4);
 
+    // The same where a living coordinator could not report the end of its stream.
+    one.database.ledger().unwrap().reserve(&Tenant::default(), &blob, None, None).await.unwrap();
+    assert_eq!(one.blobs.used_bytes().await.unwrap(), 4 + blob.bytes);
+    place.sql("UPDATE uploads SET changed_ms = changed_ms - 120000").await;
+    one.blobs.remove_unused(SystemTime::now() - DAY, HashSet::new()).await.unwrap();
+    assert_eq!(one.blobs.used_bytes().await.unwrap(), 4);
+
     // The bucket has lost an object.
     std::fs::remove_file(key(&place.server, &kept)).unwrap();
     assert!(matches!(one.blobs.read(&kept).await, Err(ObjectError::NotFound(_))));
@@ -211,4 +253,50 @@ async fn a_damaged_blob_is_quarantined_for_all_coordinators() {
     assert_eq!(std::fs::read(objects(&place.server, "damaged").join(&blob.digest)).unwrap(), b"the troth");
     send(&other.blobs, b"the truth", 0, 9).await.finish().await.unwrap();
     assert_eq!(one.blobs.read(&blob).await.unwrap(), &b"the truth"[..]);
+}
+
+#[tokio::test]
+async fn a_removal_of_another_coordinator_takes_no_new_blob() {
+    let Some(place) = Place::new() else { return };
+    let [one, other] = [place.coordinator().await, place.coordinator().await];
+    let (ledger, tenant) = (other.database.ledger().unwrap(), Tenant::default());
+    let blob = one.blobs.put(Bytes::from_static(b"a plan")).await.unwrap();
+    let digests = [blob.digest.clone()];
+    // The other one's removal was late, was announced again by this one, and ended: it cannot end it again.
+    let late = ledger.condemn(&tenant, &digests, None).await.unwrap();
+    assert!(ledger.condemn(&tenant, &digests, None).await.unwrap().is_empty(), "two remove it");
+    place.sql("UPDATE blobs SET going_until_ms = now_ms() - 1").await;
+    assert!(one.blobs.contains(&blob).await.unwrap());
+    ledger.removed(&tenant, &late).await.unwrap();
+    assert!(one.blobs.contains(&blob).await.unwrap());
+
+    // A blob that is complete in the moment of a removal is written again once the removal has ended.
+    let removal = ledger.condemn(&tenant, &digests, None).await.unwrap();
+    assert!(!ledger.publish(&tenant, &blob).await.unwrap(), "it counts, and its object goes");
+    std::fs::remove_file(key(&place.server, &blob)).unwrap();
+    ledger.removed(&tenant, &removal).await.unwrap();
+    assert!(!one.blobs.contains(&blob).await.unwrap());
+
+    // An object that was listed before the other one removed it gets no row that counts.
+    let listed = UsedBlob { blob: blob.clone(), used_ms: 1 };
+    ledger.add(&tenant, &[listed], false).await.unwrap();
+    assert!(!one.blobs.contains(&blob).await.unwrap());
+    one.blobs.put(Bytes::from_static(b"a plan")).await.unwrap();
+    assert_eq!(other.blobs.read(&blob).await.unwrap(), &b"a plan"[..]);
+    assert_eq!(other.blobs.used_bytes().await.unwrap(), 6);
+}
+
+#[tokio::test]
+async fn an_upload_whose_caller_leaves_at_its_begin_counts_nothing() {
+    let Some(place) = Place::new() else { return };
+    let one = place.coordinator().await;
+    let blob = BlobRef::of(&content(1 << 20));
+    drop(one.blobs.begin_write(&blob, 0, None).await.unwrap().unwrap());
+    for _ in 0..100 {
+        if one.blobs.used_bytes().await.unwrap() == 0 {
+            return;
+        }
+        tokio::time::sleep(Duration::from_millis(50)).await;
+    }
+    panic!("{} bytes count", one.blobs.used_bytes().await.unwrap());
 }

@@ -82,11 +82,12 @@ impl TenantBlobs {
             ObjectsAt::Folder(root) => {
                 BlobStore::open(&Self::folder(root, tenant), self.min_free_bytes, self.clock)?
             }
-            ObjectsAt::Bucket { store, .. } => {
+            ObjectsAt::Bucket { store, signing, .. } => {
+                let signing = signing.as_ref().map(|signing| signing.under(&prefix(tenant)));
                 let staging = Self::folder(&self.data_dir, tenant).join("staging");
                 let shared =
                     self.ledger.as_ref().map(|ledger| SharedRows::new(Arc::clone(ledger), tenant.clone()));
-                BlobStore::open_bucket(of_tenant(store, tenant), staging, self.clock, shared).await?
+                BlobStore::open_bucket(of_tenant(store, tenant), staging, self.clock, shared, signing).await?
             }
         };
         Ok(Arc::new(store))

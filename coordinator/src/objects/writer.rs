@@ -111,6 +111,7 @@ impl BlobWriter {
                     return Err(self.discard(message).await);
                 }
                 file.publish().await?;
+                // On a disk, garbage collection and uploads exclude each other.
                 self.claim.complete(self.blob.bytes).await?;
             }
             Body::Segments(segments) => segments.publish().await?,

@@ -15,7 +15,7 @@ use super::{datasets, encode};
 use crate::access::guard::caller;
 use crate::access::{Principal, Role};
 use crate::metrics::Metrics;
-use crate::objects::{BlobStore, BlobWriter, ObjectError};
+use crate::objects::{BlobStore, BlobWriter, DIRECT_FROM_BYTES, ObjectError, SignedRequest};
 use crate::schedule::Tenant;
 use crate::service_error::ServiceError;
 use crate::state::{State, stopped};
@@ -40,6 +40,49 @@ impl Uploads {
 
     async fn objects(&self, caller: &Principal, job_id: &str) -> Result<Arc<BlobStore>, ServiceError> {
         Ok(self.0.objects.of(&self.tenant(caller, job_id).await?).await?)
+    }
+
+    /// Where a call writes.
+    async fn place(&self, caller: &Principal, job_id: &str) -> Result<Destination, ServiceError> {
+        let tenant = self.tenant(caller, job_id).await?;
+        let objects = self.0.objects.of(&tenant).await?;
+        // Uploads of workers are accepted: a quota is no reason to discard hours of work. Without tokens,
+        // workers are recognised by the job that they name.
+        let is_result =
+            if self.0.access.asks_for_tokens() { caller.role == Role::Worker } else { !job_id.is_empty() };
+        let limit_bytes = if is_result { None } else { self.0.limit_bytes(&tenant).await? };
+        Ok(Destination { tenant, objects, limit_bytes })
+    }
+
+    async fn sign(
+        &self,
+        caller: &Principal,
+        request: v1::SignWriteRequest,
+    ) -> Result<v1::SignWriteResponse, ServiceError> {
+        let blob = encode::required_blob("blob", request.blob)?;
+        let place = self.place(caller, &request.job_id).await?;
+        if place.objects.contains(&blob).await? {
+            return Ok(v1::SignWriteResponse { complete: true, ..Default::default() });
+        }
+        let signed = place.objects.sign_write(&blob, place.limit_bytes).await;
+        let Some(signed) = signed.map_err(|error| place.fault(error))? else {
+            return Ok(v1::SignWriteResponse::default());
+        };
+        let SignedRequest { url, headers } = signed.request;
+        Ok(v1::SignWriteResponse { complete: false, url, headers, upload: signed.upload })
+    }
+
+    async fn finish(
+        &self,
+        caller: &Principal,
+        request: v1::FinishWriteRequest,
+    ) -> Result<v1::FinishWriteResponse, ServiceError> {
+        let blob = encode::required_blob("blob", request.blob)?;
+        let place = self.place(caller, &request.job_id).await?;
+        let finished = place.objects.finish_write(&blob, &request.upload, place.limit_bytes).await;
+        finished.map_err(|error| place.fault(error))?;
+        self.0.metrics.uploaded_directly(blob.bytes);
+        Ok(v1::FinishWriteResponse {})
     }
 
     async fn missing(
@@ -70,24 +113,9 @@ impl Uploads {
         let first = pieces.message().await.map_err(|status| ServiceError::Door(Box::new(status)))?;
         let first = first.ok_or_else(empty)?;
         let blob = encode::required_blob("blob", first.blob.clone())?;
-        let tenant = self.tenant(caller, &first.job_id).await?;
-        let objects = self.0.objects.of(&tenant).await?;
-        // Uploads of workers are accepted: a quota is no reason to discard hours of work. Without tokens,
-        // workers are recognised by the job that they name.
-        let is_result = if self.0.access.asks_for_tokens() {
-            caller.role == Role::Worker
-        } else {
-            !first.job_id.is_empty()
-        };
-        let limit_bytes = if is_result { None } else { self.0.limit_bytes(&tenant).await? };
-        let begun =
-            objects.begin_write(&blob, first.offset_bytes, limit_bytes).await.map_err(|error| match error {
-                ObjectError::OverLimit { used_bytes, limit_bytes } => {
-                    ServiceError::TooManyBytes { tenant: tenant.clone(), used_bytes, limit_bytes }
-                }
-                error => error.into(),
-            });
-        let Some(mut writer) = begun? else {
+        let place = self.place(caller, &first.job_id).await?;
+        let begun = place.objects.begin_write(&blob, first.offset_bytes, place.limit_bytes).await;
+        let Some(mut writer) = begun.map_err(|error| place.fault(error))? else {
             return Ok(v1::WriteBlobResponse { committed_size_bytes: blob.bytes, complete: true });
         };
         let mut stopping = self.0.stopping.clone();
@@ -135,11 +163,20 @@ impl Uploads {
         metrics: Arc<Metrics>,
         digest: String,
         offset: u64,
+        direct: bool,
     ) -> Result<BoxStream<'static, Result<v1::ReadBlobResponse, Status>>, ServiceError> {
         let size_bytes = objects.size(&digest).await?;
         if offset > size_bytes {
             let message = format!("{offset} is beyond the end of the blob, which has {size_bytes} bytes");
             return Err(ServiceError::BadArgument { field: "offset_bytes", message });
+        }
+        if direct
+            && size_bytes - offset >= DIRECT_FROM_BYTES
+            && let Some(url) = objects.url_of(&digest).await?
+        {
+            metrics.served_directly(size_bytes - offset);
+            let answer = v1::ReadBlobResponse { offset_bytes: offset, size_bytes, data: Bytes::new(), url };
+            return Ok(stream::iter([Ok(answer)]).boxed());
         }
         let hasher = (offset == 0).then(blake3::Hasher::new);
         let reading = Reading { objects, digest, offset, size_bytes, hasher, ahead: Bytes::new() };
@@ -154,7 +191,8 @@ impl Uploads {
                 match reading.next_piece().await {
                     Ok(data) => {
                         metrics.served(data.len());
-                        let response = v1::ReadBlobResponse { offset_bytes, size_bytes, data };
+                        let response =
+                            v1::ReadBlobResponse { offset_bytes, size_bytes, data, url: String::new() };
                         Some((Ok(response), (reading, true)))
                     }
                     Err(error) => {
@@ -165,6 +203,25 @@ impl Uploads {
             }
         });
         Ok(pieces.boxed())
+    }
+}
+
+/// Where a call writes.
+struct Destination {
+    tenant: Tenant,
+    objects: Arc<BlobStore>,
+    /// Maximum bytes of the tenant, if its uploads are limited.
+    limit_bytes: Option<u64>,
+}
+
+impl Destination {
+    fn fault(&self, error: ObjectError) -> ServiceError {
+        match error {
+            ObjectError::OverLimit { used_bytes, limit_bytes } => {
+                ServiceError::TooManyBytes { tenant: self.tenant.clone(), used_bytes, limit_bytes }
+            }
+            error => error.into(),
+        }
     }
 }
 
@@ -238,7 +295,24 @@ impl UploadService for Uploads {
         let blob = encode::required_blob("blob", blob)?;
         let objects = self.objects(&caller, &job_id).await?;
         let (committed_size_bytes, complete) = objects.committed(&blob).await.map_err(ServiceError::from)?;
-        Ok(Response::new(v1::QueryBlobResponse { committed_size_bytes, complete }))
+        let direct = !complete && objects.takes_directly(&blob, committed_size_bytes);
+        Ok(Response::new(v1::QueryBlobResponse { committed_size_bytes, complete, direct }))
+    }
+
+    async fn sign_write(
+        &self,
+        request: Request<v1::SignWriteRequest>,
+    ) -> Result<Response<v1::SignWriteResponse>, Status> {
+        let caller = caller(&request)?;
+        Ok(Response::new(self.sign(&caller, request.into_inner()).await?))
+    }
+
+    async fn finish_write(
+        &self,
+        request: Request<v1::FinishWriteRequest>,
+    ) -> Result<Response<v1::FinishWriteResponse>, Status> {
+        let caller = caller(&request)?;
+        Ok(Response::new(self.finish(&caller, request.into_inner()).await?))
     }
 
     type ReadBlobStream = BoxStream<'static, Result<v1::ReadBlobResponse, Status>>;
@@ -248,9 +322,10 @@ impl UploadService for Uploads {
         request: Request<v1::ReadBlobRequest>,
     ) -> Result<Response<Self::ReadBlobStream>, Status> {
         let caller = caller(&request)?;
-        let v1::ReadBlobRequest { digest, offset_bytes, job_id } = request.into_inner();
+        let v1::ReadBlobRequest { digest, offset_bytes, job_id, direct } = request.into_inner();
         let objects = self.objects(&caller, &job_id).await?;
-        Ok(Response::new(Self::read(objects, Arc::clone(&self.0.metrics), digest, offset_bytes).await?))
+        let metrics = Arc::clone(&self.0.metrics);
+        Ok(Response::new(Self::read(objects, metrics, digest, offset_bytes, direct).await?))
     }
 
     async fn begin_upload(

@@ -18,7 +18,7 @@ use crate::objects::BlobStore;
 use crate::schedule::{FailClass, Lease, Renewed, TaskOutput, WorkerProfile};
 use crate::service_error::ServiceError;
 use crate::state::{State, stopped};
-use crate::store::{Claim, Grant, StoreError};
+use crate::store::{Claim, Grant};
 use crate::worker_registry::KnownWorker;
 
 /// Longest time that a claim waits.
@@ -89,10 +89,7 @@ impl Workers {
         let (name, adapter) = (worker.profile.name.clone(), worker.adapter.clone());
         if let Some(members) = self.0.store.members() {
             // Another coordinator may know it, and its owner.
-            let owner = caller.token_id.as_deref().unwrap_or_default();
-            let row = serde_json::to_vec(&worker)
-                .map_err(|error| StoreError::Unwritable { tree: "workers", message: error.to_string() })?;
-            if !members.register(&incarnation, owner, &row).await? {
+            if !members.register(&incarnation, worker.owner_key(), &worker.to_row()?).await? {
                 return Err(ServiceError::OtherWorker);
             }
         }

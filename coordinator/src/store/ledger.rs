@@ -33,6 +33,15 @@ pub enum Known {
     },
 }
 
+/// A removal that was announced. Only the latest one of a blob can be ended.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Removal {
+    /// The blob.
+    pub blob: BlobRef,
+    /// When it becomes late, by the database's clock, Unix milliseconds.
+    pub until_ms: u64,
+}
+
 /// A blob with the time of its last use, Unix milliseconds.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct UsedBlob {
@@ -61,21 +70,28 @@ pub trait Ledger: Send + Sync {
     async fn is_filled(&self, tenant: &Tenant) -> Result<bool, StoreError>;
     /// Records that they were.
     async fn set_filled(&self, tenant: &Tenant) -> Result<(), StoreError>;
-    /// Adds blobs that were found in the bucket; those that are known stay as they are.
-    async fn add(&self, tenant: &Tenant, found: &[UsedBlob]) -> Result<(), StoreError>;
+    /// Adds blobs that were found in the bucket; those that are known stay as they are. Unless `is_sure`,
+    /// another coordinator may have removed them since, so they begin as late removals.
+    async fn add(&self, tenant: &Tenant, found: &[UsedBlob], is_sure: bool) -> Result<(), StoreError>;
+    /// Adds an upload that was found in the bucket; one that is known stays as it is.
+    async fn add_upload(&self, tenant: &Tenant, found: &BlobRef) -> Result<(), StoreError>;
     /// What is known of blobs, in their order. Those that are there are last used now.
     async fn ask(&self, tenant: &Tenant, digests: &[&str]) -> Result<Vec<Known>, StoreError>;
-    /// Begins or continues an upload, which counts `bytes` from now on.
+    /// Begins or continues an upload, which counts `bytes` from now on. An upload that it replaces no longer
+    /// counts.
     async fn reserve(
         &self,
         tenant: &Tenant,
         blob: &BlobRef,
         limit_bytes: Option<u64>,
+        instead_of: Option<&str>,
     ) -> Result<Reserved, StoreError>;
-    /// Ends a stream of this process that leaves `bytes` of an upload in the bucket; 0 ends the upload.
+    /// Ends a stream of this process that leaves `bytes` of an upload in the bucket; 0 ends the upload. What
+    /// another coordinator has taken over stays as it is.
     async fn leave(&self, tenant: &Tenant, digest: &str, bytes: u64) -> Result<(), StoreError>;
-    /// Records a complete blob; its upload, if there is one, ends.
-    async fn publish(&self, tenant: &Tenant, blob: &BlobRef) -> Result<(), StoreError>;
+    /// Records a complete blob; its upload, if there is one, ends. False if the blob is being removed: its
+    /// object may be gone, and nothing was recorded.
+    async fn publish(&self, tenant: &Tenant, blob: &BlobRef) -> Result<bool, StoreError>;
     /// Bytes of all blobs and uploads of a tenant.
     async fn used_bytes(&self, tenant: &Tenant) -> Result<u64, StoreError>;
     /// Bytes that the uploads of some blobs count together.
@@ -90,18 +106,21 @@ pub trait Ledger: Send + Sync {
         after: &str,
         limit: usize,
     ) -> Result<Vec<BlobRef>, StoreError>;
-    /// Announces the removal of blobs, and returns those that the caller has to remove within
-    /// [`REMOVAL_WITHIN`]: not used since `before_ms`, if given, and not being removed or written.
+    /// Announces the removal of blobs that nobody else is removing, and returns those that the caller has to
+    /// remove within [`REMOVAL_WITHIN`]. With `before_ms`, only those that were not used since, and that no
+    /// stream writes.
     async fn condemn(
         &self,
         tenant: &Tenant,
         digests: &[String],
         before_ms: Option<u64>,
-    ) -> Result<Vec<BlobRef>, StoreError>;
-    /// Ends the removal of blobs whose objects are gone.
-    async fn removed(&self, tenant: &Tenant, digests: &[String]) -> Result<(), StoreError>;
-    /// Ends a late removal whose object is still there.
-    async fn keep(&self, tenant: &Tenant, digest: &str) -> Result<(), StoreError>;
+    ) -> Result<Vec<Removal>, StoreError>;
+    /// Ends removals: the objects are gone.
+    async fn removed(&self, tenant: &Tenant, removals: &[Removal]) -> Result<(), StoreError>;
+    /// Ends a removal: the object is there, and stays.
+    async fn keep(&self, tenant: &Tenant, removal: &Removal) -> Result<(), StoreError>;
+    /// Ends the uploads of this process that none of its streams writes, after a failure of the database.
+    async fn close_uploads(&self, tenant: &Tenant, written: &[String]) -> Result<(), StoreError>;
     /// Uploads that no stream of a living coordinator writes, unchanged since `before_ms`.
     async fn left_uploads(&self, tenant: &Tenant, before_ms: u64) -> Result<Vec<BlobRef>, StoreError>;
     /// Corrects what such an upload counts; 0 ends it.

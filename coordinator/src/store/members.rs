@@ -23,6 +23,9 @@ pub struct Meeting {
     pub members: u32,
     /// Workers that have called lately.
     pub workers: Vec<SharedWorker>,
+    /// Those that called this coordinator and that the database does not know: they were forgotten while it
+    /// was away.
+    pub forgotten: Vec<String>,
     /// The time to give at the next meeting, by the database's clock.
     pub time_ms: u64,
 }
@@ -39,8 +42,9 @@ pub enum Hint {
 /// The coordinators of one database.
 #[async_trait]
 pub trait Members: Send + Sync {
-    /// Reports this coordinator, and how long ago workers called it last, milliseconds. Workers that have not
-    /// called any coordinator for `forget_after_ms` are forgotten.
+    /// Reports this coordinator, and how long ago workers called it last, milliseconds. Reads the workers
+    /// that called others since `since_ms`; 0, all of them, also says that the database was gone until now.
+    /// Workers that have not called any coordinator for `forget_after_ms` are forgotten.
     async fn meet(
         &self,
         seen: &[(String, u64)],

@@ -6,9 +6,8 @@
 //! next call connects to the next address that answers.
 //!
 //! A channel of tonic would connect to the same address for ever. So each connection is a channel of its own
-//! that connects only once. It has the endpoint of its
-//! address. So a certificate is verified against the name that was really connected to, and the calls carry
-//! that name, by which a proxy may route them.
+//! that connects only once, with the endpoint of its address. A certificate is therefore verified against the
+//! name that was really connected to. The calls carry that name too, by which a proxy may route them.
 //!
 //! All callers share one attempt, which no caller interrupts. So many callers do not multiply the time limits
 //! of dead addresses, and a caller with a short limit does not begin at the first address again and again.

@@ -276,6 +276,57 @@ async fn a_second_coordinator_is_kept_away_until_the_first_is_gone() {
     assert!(waits.is_err(), "one that cannot share its files has it too");
 }
 
+#[tokio::test]
+async fn leases_are_extended_after_a_time_without_coordinators() {
+    let Some(url) = database() else { return };
+    let mut admin = <::sqlx::PgConnection as ::sqlx::Connection>::connect(&url).await.unwrap();
+    // A busy machine needs no quarter of a lease from one call to the next.
+    let options = PostgresOptions { lease_ms: 60_000, ..options_of(&url) };
+    let one = PostgresStore::open(&options).await.unwrap();
+    let other = PostgresStore::open(&options).await.unwrap();
+    let lease = "INSERT INTO leases (job_id, stage, part, fence, attempt, call, deadline_ms, still_since_ms) \
+                 VALUES ('job', 0, 0, 1, 1, '', 1, 1)";
+    ::sqlx::query(lease).execute(&mut admin).await.unwrap();
+    let deadline_ms = async |admin: &mut ::sqlx::PgConnection| -> i64 {
+        ::sqlx::query_scalar("SELECT deadline_ms FROM leases").fetch_one(admin).await.unwrap()
+    };
+    one.extend_leases(0).await.unwrap();
+    let extended_ms = deadline_ms(&mut admin).await;
+    assert!(extended_ms > 1, "the first coordinator");
+    other.extend_leases(0).await.unwrap();
+    assert_eq!(deadline_ms(&mut admin).await, extended_ms, "workers could renew at the first one");
+    ::sqlx::query("UPDATE members SET seen_ms = seen_ms - 60000").execute(&mut admin).await.unwrap();
+    ::sqlx::query("UPDATE leases SET deadline_ms = 1").execute(&mut admin).await.unwrap();
+    // The first report does it, whichever call that is.
+    other.members().unwrap().meet(&[], 0, 60_000).await.unwrap();
+    let extended_ms = deadline_ms(&mut admin).await;
+    assert!(extended_ms > 1, "nobody could renew");
+    one.extend_leases(0).await.unwrap();
+    assert_eq!(deadline_ms(&mut admin).await, extended_ms);
+}
+
+#[tokio::test]
+async fn coordinators_know_the_workers_of_each_other() {
+    let Some(url) = database() else { return };
+    let mut members = Vec::new();
+    for _ in 0..2 {
+        members.push(PostgresStore::open(&options_of(&url)).await.unwrap().members().unwrap());
+    }
+    let id = "0b2f5d6e-9d9e-4a54-8c1c-0a1f7c1b0001";
+    assert!(members[0].register(id, "ana", b"a row").await.unwrap());
+    assert!(!members[1].register(id, "eve", b"another").await.unwrap(), "an id is no secret");
+    let seen = [(id.to_owned(), 5)];
+    let first = members[0].meet(&seen, 0, 60_000).await.unwrap();
+    assert_eq!(first.forgotten, Vec::<String>::new());
+    let met = members[1].meet(&[], 0, 60_000).await.unwrap();
+    assert_eq!((met.members, met.workers[0].registered.as_deref()), (2, Some(&b"a row"[..])));
+    members[0].leave().await.unwrap();
+    assert_eq!(members[1].meet(&[], 0, 60_000).await.unwrap().members, 1);
+    // Forgotten while the database was away: its coordinator hears of it.
+    members[1].forget(&[id.to_owned()]).await.unwrap();
+    assert_eq!(members[0].meet(&seen, 0, 60_000).await.unwrap().forgotten, [id]);
+}
+
 /// A killed server forgets nothing that it acknowledged; calls meanwhile end with an error that passes.
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
 async fn a_killed_server_loses_nothing_and_calls_go_on_after_it() {

@@ -12,7 +12,7 @@ use sqlx::{Connection, PgConnection};
 use tonic::async_trait;
 
 use super::super::StoreError;
-use super::super::ledger::{Known, Ledger, REMOVAL_WITHIN, Reserved, UsedBlob};
+use super::super::ledger::{Known, Ledger, REMOVAL_WITHIN, Removal, Reserved, UsedBlob};
 use super::locks::{self, Held};
 use super::rows::number;
 use super::{Borrowed, Inner, unavailable};
@@ -21,6 +21,8 @@ use crate::schedule::Tenant;
 /// How much older than its last use a row may be: a blob that is asked for again and again is not written
 /// each time. Unused blobs are kept for a day at least.
 const USED_WITHIN_MS: i64 = 10 * 60_000;
+/// An upload that began later may be missing in a list of those that this process writes.
+const BEGUN_WITHIN_MS: i64 = 60_000;
 /// Rows that one statement adds.
 const ADDED_AT_ONCE: usize = 1000;
 
@@ -73,7 +75,7 @@ impl Ledger for PostgresLedger {
         })
     }
 
-    async fn add(&self, tenant: &Tenant, found: &[UsedBlob]) -> Result<(), StoreError> {
+    async fn add(&self, tenant: &Tenant, found: &[UsedBlob], is_sure: bool) -> Result<(), StoreError> {
         let mut found: Vec<&UsedBlob> = found.iter().collect();
         found.sort_by(|a, b| a.blob.digest.cmp(&b.blob.digest));
         for some in found.chunks(ADDED_AT_ONCE) {
@@ -84,13 +86,14 @@ impl Ledger for PostgresLedger {
                 let mut tx = conn.begin().await.map_err(unavailable)?;
                 locks::bytes(&mut tx, tenant, Held::Alone).await?;
                 sqlx::query(
-                    "INSERT INTO blobs (tenant, digest, bytes, used_ms) \
-                     SELECT $1, * FROM unnest($2::bytea[], $3::bigint[], $4::bigint[]) ON CONFLICT DO NOTHING",
+                    "INSERT INTO blobs (tenant, digest, bytes, used_ms, going_until_ms) \
+                     SELECT $1, *, $5 FROM unnest($2::bytea[], $3::bigint[], $4::bigint[]) ON CONFLICT DO NOTHING",
                 )
                 .bind(tenant.as_str())
                 .bind(digests)
                 .bind(bytes)
                 .bind(used_ms)
+                .bind((!is_sure).then_some(0_i64))
                 .execute(&mut *tx)
                 .await
                 .map_err(unavailable)?;
@@ -98,6 +101,24 @@ impl Ledger for PostgresLedger {
             })?;
         }
         Ok(())
+    }
+
+    async fn add_upload(&self, tenant: &Tenant, found: &BlobRef) -> Result<(), StoreError> {
+        let digest = key(&found.digest)?;
+        on!(self.0, pool, |conn| async {
+            sqlx::query(
+                "INSERT INTO uploads (tenant, digest, bytes, member, is_written, changed_ms) \
+                 VALUES ($1, $2, $3, $4, false, now_ms()) ON CONFLICT DO NOTHING",
+            )
+            .bind(tenant.as_str())
+            .bind(digest)
+            .bind(number(found.bytes))
+            .bind(&self.0.member)
+            .execute(conn)
+            .await
+            .map_err(unavailable)?;
+            Ok(())
+        })
     }
 
     async fn ask(&self, tenant: &Tenant, digests: &[&str]) -> Result<Vec<Known>, StoreError> {
@@ -112,22 +133,28 @@ impl Ledger for PostgresLedger {
         tenant: &Tenant,
         blob: &BlobRef,
         limit_bytes: Option<u64>,
+        instead_of: Option<&str>,
     ) -> Result<Reserved, StoreError> {
         let (digest, member) = (key(&blob.digest)?, &self.0.member);
-        on!(self.0, pool, |conn| reserve(conn, tenant, member, &digest, blob.bytes, limit_bytes))
+        let replaced = instead_of.map(key).transpose()?;
+        let replaced = replaced.as_deref();
+        on!(self.0, pool, |conn| reserve(conn, tenant, member, &digest, blob.bytes, limit_bytes, replaced))
     }
 
     async fn leave(&self, tenant: &Tenant, digest: &str, bytes: u64) -> Result<(), StoreError> {
         let digest = key(digest)?;
         on!(self.0, pool, |conn| async {
-            // The client may have gone on at another coordinator, whose upload it is then.
+            // The client may have gone on at another coordinator, whose upload it is then. That one may have
+            // ended already, and what this one leaves still counts.
             let statement = match bytes {
                 0 => {
                     "DELETE FROM uploads WHERE tenant = $1 AND digest = $2 AND member = $3 AND $4::bigint = 0"
                 }
                 _ => {
-                    "UPDATE uploads SET bytes = $4, is_written = false, changed_ms = now_ms() \
-                     WHERE tenant = $1 AND digest = $2 AND member = $3"
+                    "INSERT INTO uploads (tenant, digest, member, bytes, is_written, changed_ms) \
+                     VALUES ($1, $2, $3, $4, false, now_ms()) ON CONFLICT (tenant, digest) DO UPDATE \
+                     SET bytes = excluded.bytes, is_written = false, changed_ms = excluded.changed_ms \
+                     WHERE uploads.member = excluded.member"
                 }
             };
             sqlx::query(statement)
@@ -142,22 +169,25 @@ impl Ledger for PostgresLedger {
         })
     }
 
-    async fn publish(&self, tenant: &Tenant, blob: &BlobRef) -> Result<(), StoreError> {
+    async fn publish(&self, tenant: &Tenant, blob: &BlobRef) -> Result<bool, StoreError> {
         let digest = key(&blob.digest)?;
-        on!(self.0, pool, |conn| async {
-            sqlx::query(
-                "WITH ended AS (DELETE FROM uploads WHERE tenant = $1 AND digest = $2) \
-                 INSERT INTO blobs (tenant, digest, bytes, used_ms) VALUES ($1, $2, $3, now_ms()) \
-                 ON CONFLICT (tenant, digest) DO UPDATE SET used_ms = excluded.used_ms",
+        let published: Option<bool> = on!(self.0, pool, |conn| async {
+            sqlx::query_scalar(
+                "WITH published AS (INSERT INTO blobs (tenant, digest, bytes, used_ms) \
+                 VALUES ($1, $2, $3, now_ms()) ON CONFLICT (tenant, digest) DO UPDATE \
+                 SET bytes = excluded.bytes, used_ms = excluded.used_ms WHERE blobs.going_until_ms IS NULL \
+                 RETURNING true AS is_done), ended AS (DELETE FROM uploads \
+                 WHERE tenant = $1 AND digest = $2 AND EXISTS (SELECT 1 FROM published)) \
+                 SELECT is_done FROM published",
             )
             .bind(tenant.as_str())
             .bind(digest)
             .bind(number(blob.bytes))
-            .execute(conn)
+            .fetch_optional(conn)
             .await
-            .map_err(unavailable)?;
-            Ok(())
-        })
+            .map_err(unavailable)
+        })?;
+        Ok(published.is_some())
     }
 
     async fn used_bytes(&self, tenant: &Tenant) -> Result<u64, StoreError> {
@@ -224,17 +254,18 @@ impl Ledger for PostgresLedger {
         tenant: &Tenant,
         digests: &[String],
         before_ms: Option<u64>,
-    ) -> Result<Vec<BlobRef>, StoreError> {
+    ) -> Result<Vec<Removal>, StoreError> {
         let keys = keys(digests.iter().map(String::as_str))?;
-        let found: Vec<(Vec<u8>, i64)> = on!(self.0, pool, |conn| async {
+        let found: Vec<(Vec<u8>, i64, i64)> = on!(self.0, pool, |conn| async {
             sqlx::query_as(
                 "WITH due AS (SELECT digest FROM blobs WHERE tenant = $1 AND digest = ANY($2) \
-                 AND ($3::bigint IS NULL OR used_ms < $3) \
                  AND (going_until_ms IS NULL OR going_until_ms <= now_ms()) \
+                 AND ($3::bigint IS NULL OR (used_ms < $3 \
                  AND NOT EXISTS (SELECT 1 FROM uploads AS u WHERE u.tenant = $1 AND u.digest = blobs.digest \
-                 AND u.is_written AND is_member(u.member)) ORDER BY digest FOR UPDATE) \
+                 AND u.is_written AND is_member(u.member)))) ORDER BY digest FOR UPDATE) \
                  UPDATE blobs SET going_until_ms = now_ms() + $4 FROM due \
-                 WHERE blobs.tenant = $1 AND blobs.digest = due.digest RETURNING blobs.digest, blobs.bytes",
+                 WHERE blobs.tenant = $1 AND blobs.digest = due.digest \
+                 RETURNING blobs.digest, blobs.bytes, blobs.going_until_ms",
             )
             .bind(tenant.as_str())
             .bind(keys)
@@ -244,21 +275,28 @@ impl Ledger for PostgresLedger {
             .await
             .map_err(unavailable)
         })?;
-        found.into_iter().map(blob_of).collect()
+        let removal = |(key, bytes, until_ms): (Vec<u8>, i64, i64)| {
+            Ok(Removal { blob: blob_of((key, bytes))?, until_ms: until_ms.unsigned_abs() })
+        };
+        found.into_iter().map(removal).collect()
     }
 
-    async fn removed(&self, tenant: &Tenant, digests: &[String]) -> Result<(), StoreError> {
-        let keys = keys(digests.iter().map(String::as_str))?;
+    async fn removed(&self, tenant: &Tenant, removals: &[Removal]) -> Result<(), StoreError> {
+        let keys = keys(removals.iter().map(|removal| removal.blob.digest.as_str()))?;
+        let until_ms: Vec<i64> = removals.iter().map(|removal| number(removal.until_ms)).collect();
         on!(self.0, pool, |conn| async {
             let mut tx = conn.begin().await.map_err(unavailable)?;
             locks::bytes(&mut tx, tenant, Held::Alone).await?;
             sqlx::query(
-                "WITH gone AS (SELECT digest FROM blobs WHERE tenant = $1 AND digest = ANY($2) \
-                 AND going_until_ms IS NOT NULL ORDER BY digest FOR UPDATE) \
+                "WITH gone AS (SELECT blobs.digest FROM blobs \
+                 JOIN unnest($2::bytea[], $3::bigint[]) AS ended (digest, until_ms) \
+                 ON blobs.digest = ended.digest AND blobs.going_until_ms = ended.until_ms \
+                 WHERE blobs.tenant = $1 ORDER BY blobs.digest FOR UPDATE OF blobs) \
                  DELETE FROM blobs USING gone WHERE blobs.tenant = $1 AND blobs.digest = gone.digest",
             )
             .bind(tenant.as_str())
             .bind(keys)
+            .bind(until_ms)
             .execute(&mut *tx)
             .await
             .map_err(unavailable)?;
@@ -266,15 +304,35 @@ impl Ledger for PostgresLedger {
         })
     }
 
-    async fn keep(&self, tenant: &Tenant, digest: &str) -> Result<(), StoreError> {
-        let digest = key(digest)?;
+    async fn keep(&self, tenant: &Tenant, removal: &Removal) -> Result<(), StoreError> {
+        let digest = key(&removal.blob.digest)?;
         on!(self.0, pool, |conn| async {
             sqlx::query(
                 "UPDATE blobs SET going_until_ms = NULL, used_ms = now_ms() \
-                 WHERE tenant = $1 AND digest = $2 AND going_until_ms <= now_ms()",
+                 WHERE tenant = $1 AND digest = $2 AND going_until_ms = $3",
             )
             .bind(tenant.as_str())
             .bind(digest)
+            .bind(number(removal.until_ms))
+            .execute(conn)
+            .await
+            .map_err(unavailable)?;
+            Ok(())
+        })
+    }
+
+    async fn close_uploads(&self, tenant: &Tenant, written: &[String]) -> Result<(), StoreError> {
+        let keys = keys(written.iter().map(String::as_str))?;
+        on!(self.0, pool, |conn| async {
+            sqlx::query(
+                "UPDATE uploads SET is_written = false \
+                 WHERE tenant = $1 AND member = $2 AND is_written AND digest <> ALL($3) \
+                 AND changed_ms < now_ms() - $4",
+            )
+            .bind(tenant.as_str())
+            .bind(&self.0.member)
+            .bind(keys)
+            .bind(BEGUN_WITHIN_MS)
             .execute(conn)
             .await
             .map_err(unavailable)?;
@@ -394,6 +452,7 @@ async fn reserve(
     digest: &[u8],
     bytes: u64,
     limit_bytes: Option<u64>,
+    replaced: Option<&[u8]>,
 ) -> Result<Reserved, StoreError> {
     let mut tx = conn.begin().await.map_err(unavailable)?;
     // It need not wait for the database's disk. What a crash of the database loses counts again when the
@@ -403,18 +462,27 @@ async fn reserve(
     if let Some(limit_bytes) = limit_bytes {
         // One after the other: many that begin at once could exceed the limit together.
         locks::bytes(&mut tx, tenant, Held::Alone).await?;
-        let counted: Option<i64> =
-            sqlx::query_scalar("SELECT bytes FROM uploads WHERE tenant = $1 AND digest = $2")
+        let counted: Vec<i64> =
+            sqlx::query_scalar("SELECT bytes FROM uploads WHERE tenant = $1 AND digest IN ($2, $3)")
                 .bind(tenant.as_str())
                 .bind(digest)
-                .fetch_optional(&mut *tx)
+                .bind(replaced)
+                .fetch_all(&mut *tx)
                 .await
                 .map_err(unavailable)?;
-        let all = used_bytes(&mut tx, tenant).await?;
-        let used_bytes = all.saturating_sub(counted.unwrap_or(0).unsigned_abs());
+        let counted = counted.into_iter().fold(0_u64, |sum, bytes| sum.saturating_add(bytes.unsigned_abs()));
+        let used_bytes = used_bytes(&mut tx, tenant).await?.saturating_sub(counted);
         if used_bytes.saturating_add(bytes) > limit_bytes {
             return Ok(Reserved::OverLimit { used_bytes });
         }
+    }
+    if let Some(replaced) = replaced {
+        sqlx::query("DELETE FROM uploads WHERE tenant = $1 AND digest = $2")
+            .bind(tenant.as_str())
+            .bind(replaced)
+            .execute(&mut *tx)
+            .await
+            .map_err(unavailable)?;
     }
     sqlx::query(
         "INSERT INTO uploads (tenant, digest, bytes, member, is_written, changed_ms) \

@@ -25,6 +25,11 @@ pub async fn bytes(tx: &mut PgConnection, tenant: &Tenant, held: Held) -> Result
     lock(tx, key("bytes", tenant.as_str().as_bytes()), held).await
 }
 
+/// Locks the reports of coordinators.
+pub async fn members(tx: &mut PgConnection) -> Result<(), StoreError> {
+    lock(tx, key("members", b""), Held::Alone).await
+}
+
 /// Locks the revocation of tokens.
 pub async fn revocations(tx: &mut PgConnection) -> Result<(), StoreError> {
     lock(tx, key("revocations", b""), Held::Alone).await

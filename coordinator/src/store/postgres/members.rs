@@ -1,17 +1,18 @@
 //! The coordinators of a database and their workers: [`Members`].
 
+use std::collections::HashSet;
 use std::sync::Arc;
 
 use futures::StreamExt;
 use futures::stream::BoxStream;
-use sqlx::PgConnection;
 use sqlx::postgres::PgListener;
+use sqlx::{Connection, PgConnection};
 use tonic::async_trait;
 
 use super::super::StoreError;
 use super::super::members::{Hint, Meeting, Members, SharedWorker};
 use super::rows::number;
-use super::{Borrowed, Inner, database_ms, opening, unavailable};
+use super::{Borrowed, Inner, database_ms, leases, locks, opening, unavailable};
 
 /// The channel of hints.
 const CHANNEL: &str = "fathom";
@@ -33,8 +34,10 @@ impl Members for PostgresMembers {
         since_ms: u64,
         forget_after_ms: u64,
     ) -> Result<Meeting, StoreError> {
-        let member = &self.0.member;
-        on!(self.0, renewals, |conn| meet(conn, member, seen, since_ms, forget_after_ms))
+        on!(self.0, renewals, |conn| async {
+            be_there(&self.0, conn, since_ms == 0).await?;
+            meet(conn, seen, since_ms, forget_after_ms).await
+        })
     }
 
     async fn leave(&self) -> Result<(), StoreError> {
@@ -121,34 +124,31 @@ impl Members for PostgresMembers {
 
 async fn meet(
     conn: &mut PgConnection,
-    member: &str,
     seen: &[(String, u64)],
     since_ms: u64,
     forget_after_ms: u64,
 ) -> Result<Meeting, StoreError> {
     let now_ms = database_ms(conn).await?;
-    sqlx::query(
-        "INSERT INTO members VALUES ($1, now_ms()) ON CONFLICT (member) DO UPDATE SET seen_ms = excluded.seen_ms",
-    )
-    .bind(member)
-    .execute(&mut *conn)
-    .await
-    .map_err(unavailable)?;
+    let mut forgotten = Vec::new();
     if !seen.is_empty() {
         let (incarnations, ages): (Vec<&str>, Vec<i64>) =
             seen.iter().map(|(incarnation, age_ms)| (incarnation.as_str(), number(*age_ms))).unzip();
-        sqlx::query(
+        let known: Vec<String> = sqlx::query_scalar(
             "WITH seen AS (SELECT w.incarnation, given.age FROM workers AS w \
              JOIN unnest($1::text[], $2::bigint[]) AS given (incarnation, age) USING (incarnation) \
              ORDER BY w.incarnation FOR UPDATE OF w) \
              UPDATE workers SET seen_ms = greatest(seen_ms, now_ms() - seen.age) FROM seen \
-             WHERE workers.incarnation = seen.incarnation",
+             WHERE workers.incarnation = seen.incarnation RETURNING workers.incarnation",
         )
         .bind(incarnations)
         .bind(ages)
-        .execute(&mut *conn)
+        .fetch_all(&mut *conn)
         .await
         .map_err(unavailable)?;
+        let known: HashSet<String> = known.into_iter().collect();
+        forgotten.extend(
+            seen.iter().map(|(incarnation, _)| incarnation).filter(|one| !known.contains(*one)).cloned(),
+        );
     }
     for (statement, after_ms) in [
         (
@@ -184,15 +184,49 @@ async fn meet(
     Ok(Meeting {
         members: u32::try_from(members).unwrap_or(1).max(1),
         workers: workers.collect(),
+        forgotten,
         time_ms: now_ms.saturating_sub(VISIBLE_WITHIN_MS),
     })
 }
 
-/// Time since any coordinator of the database reported itself, milliseconds; `None` if none ever did.
-pub async fn alone_for_ms(conn: &mut PgConnection) -> Result<Option<u64>, StoreError> {
-    let since: Option<i64> = sqlx::query_scalar("SELECT now_ms() - max(seen_ms) FROM members")
+/// Reports this coordinator. If none has reported itself for a while, no worker could renew: then every lease
+/// gets a full period, by the first coordinator that is back. While another one takes calls, workers can
+/// renew there, and a coordinator that crashes at every start would keep the leases of dead workers alive.
+///
+/// `was_away`: this process has just started, or has found the database gone. Otherwise the gap must be half
+/// a lease: with a database that is merely slow, each report would extend the leases.
+pub async fn be_there(inner: &Inner, conn: &mut PgConnection, was_away: bool) -> Result<(), StoreError> {
+    let settings = &inner.settings;
+    let gap_ms = if was_away { settings.short_gap_ms() } else { settings.lease_ms / 2 };
+    // Without a lock: a coordinator that is cut off while it has one would keep the others waiting.
+    if !are_all_away(conn, gap_ms).await? {
+        return report(inner, conn).await;
+    }
+    let mut tx = conn.begin().await.map_err(unavailable)?;
+    locks::members(&mut tx).await?;
+    if are_all_away(&mut tx, gap_ms).await? {
+        leases::extend(settings, &mut tx, None).await?;
+    }
+    report(inner, &mut tx).await?;
+    tx.commit().await.map_err(unavailable)
+}
+
+/// Whether no coordinator has reported itself for longer than `gap_ms`.
+async fn are_all_away(conn: &mut PgConnection, gap_ms: u64) -> Result<bool, StoreError> {
+    let alone_for_ms: Option<i64> = sqlx::query_scalar("SELECT now_ms() - max(seen_ms) FROM members")
         .fetch_one(conn)
         .await
         .map_err(unavailable)?;
-    Ok(since.map(|since| since.max(0).unsigned_abs()))
+    Ok(alone_for_ms.is_none_or(|alone_for_ms| alone_for_ms > number(gap_ms)))
+}
+
+async fn report(inner: &Inner, conn: &mut PgConnection) -> Result<(), StoreError> {
+    sqlx::query(
+        "INSERT INTO members VALUES ($1, now_ms()) ON CONFLICT (member) DO UPDATE SET seen_ms = excluded.seen_ms",
+    )
+    .bind(&inner.member)
+    .execute(conn)
+    .await
+    .map_err(unavailable)?;
+    Ok(())
 }

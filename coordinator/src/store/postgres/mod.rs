@@ -87,7 +87,7 @@ use crate::schedule::{
 /// (`opening`), so only a cut network takes this long.
 const ANSWER_WITHIN: Duration = Duration::from_secs(20);
 
-/// Time without any coordinator that costs no worker its lease; coordinators report themselves every second.
+/// See [`Settings::short_gap_ms`].
 const SHORT_GAP_MS: u64 = 2500;
 
 /// Jobs in PostgreSQL.
@@ -132,6 +132,12 @@ impl Settings {
     /// The time for a statement; NULL stands for the database's clock.
     fn given_ms(&self, now_ms: u64) -> Option<i64> {
         (!self.by_database_clock).then(|| rows::number(now_ms))
+    }
+
+    /// Time without any coordinator that costs no worker its lease: workers renew every quarter of it, and
+    /// coordinators report themselves every second, or more often where leases are short.
+    fn short_gap_ms(&self) -> u64 {
+        SHORT_GAP_MS.min(self.lease_ms / 4)
     }
 
     fn or_default(&self, quota: Option<Quota>) -> Quota {
@@ -278,13 +284,6 @@ impl JobStore for PostgresStore {
                 Err(error) => return Err(error),
             }
         }
-        // While another coordinator took calls, workers could renew. A coordinator that crashes at every
-        // start would keep the leases of dead workers alive.
-        let alone_for_ms = on!(self.0, pool, |conn| members::alone_for_ms(conn))?;
-        let short_ms = SHORT_GAP_MS.min(self.0.settings.lease_ms / 4);
-        if alone_for_ms.is_some_and(|alone_for_ms| alone_for_ms <= short_ms) {
-            return Ok(());
-        }
         self.extend_leases(now_ms).await
     }
 
@@ -294,7 +293,10 @@ impl JobStore for PostgresStore {
 
     async fn extend_leases(&self, now_ms: u64) -> Result<(), StoreError> {
         let settings = &self.0.settings;
-        on!(self.0, pool, |conn| leases::extend(settings, conn, settings.given_ms(now_ms)))
+        match settings.given_ms(now_ms) {
+            None => on!(self.0, pool, |conn| members::be_there(&self.0, conn, true)),
+            given_ms => on!(self.0, pool, |conn| leases::extend(settings, conn, given_ms)),
+        }
     }
 
     async fn job(&self, job: &JobId) -> Result<JobView, StoreError> {

@@ -35,6 +35,9 @@ app.kubernetes.io/instance: {{ .Release.Name }}
 {{- if and .Values.keda.clientCaSecret (not $c.tlsSecret) }}
 {{- fail "keda.clientCaSecret needs coordinator.tlsSecret: certificates are sent over TLS only" }}
 {{- end }}
+{{- if and (gt (int $c.replicas) 1) (or (not .Values.database.secret) (not .Values.objects.url)) }}
+{{- fail "several coordinators share a database and a bucket: set database.secret and objects.url, or coordinator.replicas=1" }}
+{{- end }}
 {{- end }}
 
 {{/* Containers run as the user of the image, with nothing that they do not need. */}}

@@ -1,0 +1,246 @@
+//! Clients that use the bucket themselves, with an S3 server that somebody else wrote.
+
+use std::time::Duration;
+
+use fathom_proto::direct::{Content, Direct, DirectError};
+
+use super::bucket_tests::{at, content, object_count};
+use super::direct::{DirectWrite, UNFINISHED_FOR};
+use super::s3_server::{S3Server, age};
+use super::*;
+use crate::schedule::Tenant;
+
+const BYTES: usize = 300_000;
+
+async fn opened(server: &S3Server, data_dir: &Path) -> Arc<BlobStore> {
+    let blobs = TenantBlobs::open(at(server), data_dir, 0, Clock::start(), None).await.unwrap();
+    blobs.of(&"reef".parse().unwrap()).await.unwrap()
+}
+
+fn folder(server: &S3Server, path: &str) -> PathBuf {
+    server.folder("scenes/tenants/reef/objects").join(path)
+}
+
+pub(super) async fn sent(write: &DirectWrite, content: &[u8]) -> Result<(), DirectError> {
+    let content = Content::Bytes(Bytes::copy_from_slice(content));
+    Direct::default().put(&write.request.url, &write.request.headers, content, BYTES as u64).await
+}
+
+pub(super) async fn signed(store: &Arc<BlobStore>, blob: &BlobRef) -> DirectWrite {
+    store.sign_write(blob, None).await.unwrap().expect("S3 signs")
+}
+
+async fn got(url: &str, offset: u64, bytes: u64) -> Vec<u8> {
+    let (mut pieces, mut whole) = (Direct::default().get(url, offset, bytes).await.unwrap(), Vec::new());
+    while let Some(piece) = pieces.next().await.unwrap() {
+        whole.extend_from_slice(&piece);
+    }
+    whole
+}
+
+#[tokio::test]
+async fn a_client_fetches_a_blob_from_the_bucket() {
+    let (server, dir) = (S3Server::start(), tempfile::tempdir().unwrap());
+    let store = opened(&server, dir.path()).await;
+    let content = content(BYTES);
+    let blob = store.put(content.clone().into()).await.unwrap();
+    let url = store.url_of(&blob.digest).await.unwrap().expect("S3 signs");
+    assert!(got(&url, 0, blob.bytes).await == content);
+    assert!(got(&url, 1000, blob.bytes - 1000).await == content[1000..]);
+
+    let other = store.put(Bytes::from_static(b"of the same tenant")).await.unwrap();
+    let forged = url.replace(&blob.digest, &other.digest).replace(&blob.digest[..2], &other.digest[..2]);
+    let refused = Direct::default().get(&forged, 0, other.bytes).await.unwrap_err();
+    assert!(matches!(refused, DirectError::Refused(status) if status == 403), "{refused}");
+
+    let with_tls = at(&server).signed_by(|signing| Some(signing.with_tls()));
+    let folder = ObjectsAt::Folder(dir.path().join("folder"));
+    for place in [with_tls, at(&server).signed_by(|_| None), folder] {
+        let blobs = TenantBlobs::open(place, dir.path(), 0, Clock::start(), None).await.unwrap();
+        let store = blobs.of(&Tenant::default()).await.unwrap();
+        let blob = store.put(content.clone().into()).await.unwrap();
+        assert_eq!(store.url_of(&blob.digest).await.unwrap(), None);
+        assert!(store.sign_write(&BlobRef::of(&[1; BYTES]), None).await.unwrap().is_none());
+    }
+}
+
+#[tokio::test]
+async fn what_a_client_sends_is_hashed_before_it_is_a_blob() {
+    let (server, dir) = (S3Server::start(), tempfile::tempdir().unwrap());
+    let store = opened(&server, dir.path()).await;
+    let content = content(BYTES);
+    let blob = BlobRef::of(&content);
+    let write = signed(&store, &blob).await;
+    assert_eq!(store.used_bytes().await.unwrap(), blob.bytes, "it counts from then on");
+    sent(&write, &content).await.unwrap();
+    assert!(!store.contains(&blob).await.unwrap(), "nobody has hashed it");
+    store.finish_write(&blob, &write.upload, None).await.unwrap();
+    assert!(store.read(&blob).await.unwrap() == content);
+    assert_eq!(store.used_bytes().await.unwrap(), blob.bytes, "it counts once");
+    assert_eq!(object_count(&folder(&server, "uploads")), 0);
+    until_empty(&folder(&server, "direct")).await;
+
+    // The URL is still valid.
+    sent(&write, &vec![7; BYTES]).await.unwrap();
+    assert!(store.read(&blob).await.unwrap() == content, "a client has changed a blob");
+    store.finish_write(&blob, &write.upload, None).await.unwrap();
+    assert!(store.read(&blob).await.unwrap() == content, "a client has changed a blob");
+    until_empty(&folder(&server, "direct")).await;
+
+    let other = BlobRef::of(&[8; BYTES]);
+    let write = signed(&store, &other).await;
+    sent(&write, &content).await.unwrap();
+    let refused = store.finish_write(&other, &write.upload, None).await.unwrap_err();
+    assert!(matches!(refused, ObjectError::DigestMismatch { .. }), "{refused}");
+    assert!(!store.contains(&other).await.unwrap());
+    let used = store.used_bytes().await.unwrap();
+    assert_eq!(used, blob.bytes + other.bytes, "its client can still send it again");
+    assert_eq!(object_count(&folder(&server, "uploads")), 0, "a refused upload remains");
+    until_empty(&folder(&server, "direct")).await;
+}
+
+#[tokio::test]
+async fn a_client_sends_no_other_length_and_not_beyond_a_limit() {
+    let (server, dir) = (S3Server::start(), tempfile::tempdir().unwrap());
+    let store = opened(&server, dir.path()).await;
+    let content = content(BYTES);
+    let blob = BlobRef::of(&content);
+    let mut write = signed(&store, &blob).await;
+    for bytes in [BYTES - 1, BYTES + 1] {
+        write.request.headers.insert("content-length".into(), bytes.to_string());
+        let refused = sent(&write, &vec![7; bytes]).await.unwrap_err();
+        assert!(matches!(refused, DirectError::Refused(status) if status == 403), "{bytes} bytes: {refused}");
+    }
+    let missing = store.finish_write(&blob, &write.upload, None).await.unwrap_err();
+    assert!(matches!(missing, ObjectError::NoUpload), "{missing}");
+    for upload in ["", "../cas/00", &"0".repeat(64)] {
+        let missing = store.finish_write(&blob, upload, None).await.unwrap_err();
+        assert!(matches!(missing, ObjectError::NoUpload), "{upload}: {missing}");
+    }
+
+    // The first one counts as long as its client can send it.
+    let limit = Some(2 * blob.bytes + 1);
+    let first = store.sign_write(&blob, limit).await.unwrap().unwrap();
+    let refused = store.sign_write(&BlobRef::of(&[9; BYTES]), limit).await.err().expect("a second one");
+    assert!(matches!(refused, ObjectError::OverLimit { used_bytes: 600_000, .. }), "{refused}");
+    // Sending it here counts instead of it, as long as it lasts.
+    let through = store.begin_write(&blob, 0, limit).await.unwrap().unwrap();
+    assert_eq!(store.used_bytes().await.unwrap(), 2 * blob.bytes);
+    through.pause().await.unwrap();
+    assert_eq!(store.used_bytes().await.unwrap(), 2 * blob.bytes, "it counts no longer");
+    sent(&first, &content).await.unwrap();
+    store.finish_write(&blob, &first.upload, limit).await.unwrap();
+
+    for bytes in [1000, 300 << 20] {
+        let blob = BlobRef { bytes, ..blob.clone() };
+        assert!(!store.takes_directly(&blob, 0), "{bytes} bytes");
+        assert!(store.sign_write(&blob, None).await.unwrap().is_none(), "{bytes} bytes");
+    }
+    assert!(store.takes_directly(&blob, 0) && !store.takes_directly(&blob, 5), "a part has arrived");
+}
+
+#[tokio::test]
+async fn uploads_that_fit_are_finished_at_once_and_in_any_way() {
+    let (server, dir) = (S3Server::start(), tempfile::tempdir().unwrap());
+    let store = opened(&server, dir.path()).await;
+    let contents: Vec<Vec<u8>> = (1..=4).map(|byte| vec![byte; BYTES]).collect();
+    let blobs: Vec<BlobRef> = contents.iter().map(|content| BlobRef::of(content)).collect();
+    let limit = Some(4 * BYTES as u64);
+    let mut writes = Vec::new();
+    for (blob, content) in blobs.iter().zip(&contents) {
+        let write = store.sign_write(blob, limit).await.unwrap().unwrap();
+        sent(&write, content).await.unwrap();
+        writes.push(write);
+    }
+    let finish = |index: usize| store.finish_write(&blobs[index], &writes[index].upload, limit);
+    let (first, second) = tokio::join!(finish(0), finish(1));
+    first.unwrap();
+    second.unwrap();
+    let third = send_within(&store, &contents[2], limit).await;
+    third.finish().await.unwrap();
+    finish(3).await.unwrap();
+    assert_eq!(store.missing(&blobs).await.unwrap(), [] as [usize; 0]);
+    assert_eq!(store.used_bytes().await.unwrap(), 4 * BYTES as u64);
+}
+
+async fn send_within(store: &Arc<BlobStore>, content: &[u8], limit: Option<u64>) -> BlobWriter {
+    let mut writer = store.begin_write(&BlobRef::of(content), 0, limit).await.unwrap().unwrap();
+    writer.append(0, Bytes::copy_from_slice(content)).await.unwrap();
+    writer
+}
+
+#[tokio::test]
+async fn a_part_that_has_arrived_stays_counted() {
+    let (server, dir) = (S3Server::start(), tempfile::tempdir().unwrap());
+    let store = opened(&server, dir.path()).await;
+    let content = content(BYTES);
+    let blob = BlobRef::of(&content);
+    let mut writer = store.begin_write(&blob, 0, None).await.unwrap().unwrap();
+    writer.append(0, Bytes::copy_from_slice(&content[..100_000])).await.unwrap();
+    writer.pause().await.unwrap();
+    let write = signed(&store, &blob).await;
+    sent(&write, &[7; BYTES]).await.unwrap();
+    let refused = store.finish_write(&blob, &write.upload, None).await.unwrap_err();
+    assert!(matches!(refused, ObjectError::WrongOffset { committed_bytes: 100_000, .. }), "{refused}");
+    assert_eq!(store.used_bytes().await.unwrap(), 100_000 + blob.bytes);
+    let mut writer = store.begin_write(&blob, 100_000, None).await.unwrap().unwrap();
+    writer.append(100_000, Bytes::copy_from_slice(&content[100_000..])).await.unwrap();
+    writer.finish().await.unwrap();
+    assert_eq!(store.used_bytes().await.unwrap(), blob.bytes);
+}
+
+#[tokio::test]
+async fn what_a_client_does_not_finish_is_deleted_in_time() {
+    let (server, dir) = (S3Server::start(), tempfile::tempdir().unwrap());
+    let store = opened(&server, dir.path()).await;
+    let content = content(BYTES);
+    let blob = BlobRef::of(&content);
+    let write = signed(&store, &blob).await;
+    sent(&write, &content).await.unwrap();
+    assert_eq!(object_count(&folder(&server, "direct")), 1);
+    tokio::time::pause();
+    tokio::time::advance(Duration::from_secs(50)).await;
+    tokio::time::resume();
+    assert_eq!(store.used_bytes().await.unwrap(), blob.bytes, "it may still be on its way");
+    tokio::time::pause();
+    tokio::time::advance(Duration::from_secs(20)).await;
+    tokio::time::resume();
+    until_empty(&folder(&server, "direct")).await;
+    for _ in 0..100 {
+        if store.used_bytes().await.unwrap() == 0 {
+            break;
+        }
+        tokio::time::sleep(Duration::from_millis(50)).await;
+    }
+    assert_eq!(store.used_bytes().await.unwrap(), 0);
+    let missing = store.finish_write(&blob, &write.upload, None).await.unwrap_err();
+    assert!(matches!(missing, ObjectError::NoUpload), "{missing}");
+}
+
+#[tokio::test]
+async fn garbage_collection_removes_what_a_dead_coordinator_signed() {
+    let (server, dir) = (S3Server::start(), tempfile::tempdir().unwrap());
+    let content = content(BYTES);
+    let write = signed(&opened(&server, dir.path()).await, &BlobRef::of(&content)).await;
+    sent(&write, &content).await.unwrap();
+    let store = opened(&server, dir.path()).await;
+    assert_eq!(store.used_bytes().await.unwrap(), 0);
+    let collect = async || {
+        let week = std::time::SystemTime::now() - Duration::from_secs(7 * 86_400);
+        store.remove_unused(week, HashSet::new()).await.unwrap();
+        object_count(&folder(&server, "direct"))
+    };
+    assert_eq!(collect().await, 1, "it may still be finished");
+    age(&folder(&server, "direct").join(&write.upload), UNFINISHED_FOR + Duration::from_secs(60));
+    assert_eq!(collect().await, 0);
+}
+
+pub(super) async fn until_empty(folder: &Path) {
+    for _ in 0..100 {
+        if object_count(folder) == 0 {
+            return;
+        }
+        tokio::time::sleep(Duration::from_millis(50)).await;
+    }
+    panic!("{} still has {} files", folder.display(), object_count(folder));
+}
