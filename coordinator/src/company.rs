@@ -19,9 +19,9 @@ use crate::store::members::{Hint, Members};
 
 /// Interval of reports. A revoked token must be refused everywhere within two seconds.
 const MEET_EVERY: Duration = Duration::from_secs(1);
-/// Longest and shortest time without the database after which clients are sent away; a quarter of a lease in
+/// Shortest and longest time without the database after which clients are sent away; a quarter of a lease in
 /// between. A busy machine answers late, and a worker still has to register elsewhere before its lease ends.
-const AWAY_AFTER: [Duration; 2] = [Duration::from_secs(5), Duration::from_secs(2)];
+const AWAY_AFTER: [Duration; 2] = [Duration::from_secs(2), Duration::from_secs(5)];
 /// Changes within this time are one hint.
 const NOTIFY_EVERY: Duration = Duration::from_millis(50);
 /// Pause before it listens again after a failure of the database.
@@ -94,7 +94,7 @@ async fn meet_once(shared: &State, members: &dyn Members, since_ms: u64) -> Resu
 /// Closes all connections while this coordinator cannot reach the database, if there were others. Clients go
 /// on at another one, which may reach it, before they lose their leases.
 async fn send_away(shared: &State, connections: &Connections, met: &watch::Sender<Instant>) {
-    let [longest, shortest] = AWAY_AFTER;
+    let [shortest, longest] = AWAY_AFTER;
     let patience = (Duration::from_millis(shared.lease_ms.into()) / 4).clamp(shortest, longest);
     let mut is_away = false;
     loop {

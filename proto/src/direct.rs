@@ -36,11 +36,14 @@ const STUCK_FOR: Duration = Duration::from_secs(10);
 const LAST_FOR: Duration = Duration::from_secs(15);
 /// Bytes of an upload that are handed on at a time.
 const PIECE: usize = 256 << 10;
-/// Timeout of an upload: this, and a second for each of these bytes; as long as the coordinator waits for it.
-const SENT_WITHIN: Duration = Duration::from_secs(60);
-const SLOWEST: u64 = 256 << 10;
 /// Time after a failure without requests to the bucket.
 const AGAIN_AFTER: Duration = Duration::from_secs(60);
+
+/// The time that an upload has: a minute, and a second for each 256 KiB. The client gives it up then, and the
+/// coordinator deletes what has arrived.
+pub fn sent_within(bytes: u64) -> Duration {
+    Duration::from_secs(60 + bytes / (256 << 10))
+}
 
 /// Why a transfer with a bucket failed. It never names the URL, which contains a signature.
 #[derive(Debug, thiserror::Error)]
@@ -187,7 +190,7 @@ impl Direct {
             missing = missing.saturating_sub(piece.as_ref().map_or(0, |piece| piece.len() as u64));
             noted.send_replace(Instant::now() + if missing == 0 { LAST_FOR } else { Duration::ZERO });
         }));
-        let mut request = self.client()?.put(url).timeout(SENT_WITHIN + Duration::from_secs(bytes / SLOWEST));
+        let mut request = self.client()?.put(url).timeout(sent_within(bytes));
         for (name, value) in headers {
             request = request.header(name, value);
         }

@@ -1,6 +1,6 @@
 //! The gRPC contracts of Fathom. The `.proto` files are the documentation: their service comments describe
 //! the life cycles, and every field has a comment, which `cargo doc` shows here. Clients connect with
-//! [`dial`].
+//! [`dial`], and use the bucket of a coordinator with [`direct`].
 #![allow(clippy::doc_lazy_continuation, reason = "prost indents the second line of a list item by one space")]
 
 pub mod dial;

@@ -12,6 +12,7 @@ use std::sync::{Arc, PoisonError};
 use std::time::Duration;
 
 use fathom_core::scene::BlobRef;
+use fathom_proto::direct::sent_within;
 use object_store::ObjectStoreExt;
 use object_store::path::Path as ObjectPath;
 use tokio::sync::{Semaphore, SemaphorePermit};
@@ -19,14 +20,11 @@ use uuid::Uuid;
 
 use super::bucket::Bucket;
 use super::claim::Replaced;
-use super::signing::{DIRECT_FROM_BYTES, SignedRequest, VALID_FOR};
+use super::signing::{DIRECT_FROM_BYTES, SignedRequest};
 use super::{BlobStore, BlobWriter, ObjectError, Place, WriteClaim, check_digest, segments};
 
 /// Longer blobs go through the coordinator: a request that breaks off has to be repeated as a whole.
 const DIRECT_TO_BYTES: u64 = 256 << 20;
-/// The slowest client that can still send, bytes per second. A request may begin when its URL is about to
-/// expire.
-const SLOWEST: u64 = 256 << 10;
 /// Age after which nobody else deletes an object; longer than any upload has.
 pub(super) const UNFINISHED_FOR: Duration = Duration::from_secs(1800);
 /// Most uploads of a tenant that are signed at a time.
@@ -104,21 +102,11 @@ impl BlobStore {
         let upload = format!("{}{}", Uuid::new_v4().simple(), Uuid::new_v4().simple());
         let Some(request) = signing.to_write(&path_of(&upload), blob.bytes).await else { return Ok(None) };
         let claim = WriteClaim::take(self, &upload)?;
-        let counted = BlobRef { digest: upload.clone(), bytes: blob.bytes };
-        match &self.shared {
-            Some(shared) => {
-                claim.count(0);
-                shared.reserve(&counted, limit_bytes, None).await?;
-            }
-            None => {
-                self.declare_within(&upload, blob.bytes, limit_bytes, None)?;
-                claim.count(0);
-            }
-        }
+        self.reserve(&claim, blob.bytes, 0, limit_bytes, None).await?;
         let signed = Signed { claim, blob: blob.clone() };
         self.signed.lock().unwrap_or_else(PoisonError::into_inner).insert(upload.clone(), signed);
         let (store, ended) = (Arc::clone(self), upload.clone());
-        let time = VALID_FOR + Duration::from_secs(blob.bytes / SLOWEST);
+        let time = sent_within(blob.bytes);
         tokio::spawn(async move {
             tokio::time::sleep(time).await;
             // Also if it has become a blob: its client may have sent the object once more.

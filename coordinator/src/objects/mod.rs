@@ -447,27 +447,38 @@ impl BlobStore {
             });
         }
         self.check_space(blob.bytes.saturating_sub(offset)).await?;
+        self.reserve(claim, blob.bytes, offset, limit_bytes, replaced).await?;
+        // From here on, garbage collection of all coordinators spares the blob. A removal that was under way
+        // has ended before the answer.
+        Ok(self.shared.is_none() || !self.contains(blob).await?)
+    }
+
+    /// Counts the upload of a claim with its full length, unless the total would exceed the limit. One that
+    /// it replaces no longer counts. If the claim ends, `arrived_bytes` count.
+    async fn reserve(
+        &self,
+        claim: &WriteClaim,
+        bytes: u64,
+        arrived_bytes: u64,
+        limit_bytes: Option<u64>,
+        replaced: Option<Replaced>,
+    ) -> Result<(), ObjectError> {
+        let instead_of = replaced.as_ref().map(|replaced| replaced.upload.as_str());
         match &self.shared {
             Some(shared) => {
                 // First, so that the claim gives back what was reserved even if this caller leaves meanwhile.
-                claim.count(offset);
+                claim.count(arrived_bytes);
                 claim.replace(replaced.clone());
-                let instead_of = replaced.as_ref().map(|replaced| replaced.upload.as_str());
-                shared.reserve(blob, limit_bytes, instead_of).await?;
-                // From here on, garbage collection spares the blob. A removal that was under way has ended
-                // before the answer.
-                if self.contains(blob).await? {
-                    return Ok(false);
-                }
+                let upload = BlobRef { digest: claim.digest.clone(), bytes };
+                shared.reserve(&upload, limit_bytes, instead_of).await?;
             }
             None => {
-                let instead_of = replaced.as_ref().map(|replaced| replaced.upload.as_str());
-                self.declare_within(&blob.digest, blob.bytes, limit_bytes, instead_of)?;
-                claim.count(offset);
+                self.declare_within(&claim.digest, bytes, limit_bytes, instead_of)?;
+                claim.count(arrived_bytes);
                 claim.replace(replaced);
             }
         }
-        Ok(true)
+        Ok(())
     }
 
     /// Refuses if writing `bytes` more would leave too little free. A bucket is never full.

@@ -15,7 +15,7 @@ use super::{BlobStore, ObjectError, object_path};
 use crate::rate_limited_log::RateLimitedLog;
 
 /// How long a URL is valid. A client whose token is revoked can use for this long what it got before.
-pub(super) const VALID_FOR: Duration = Duration::from_secs(60);
+const VALID_FOR: Duration = Duration::from_secs(60);
 /// Shorter content is sent at once: the client would make a request more for it.
 pub const DIRECT_FROM_BYTES: u64 = 256 << 10;
 
