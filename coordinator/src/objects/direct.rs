@@ -32,6 +32,8 @@ const MOST_SIGNED: usize = 1024;
 /// Uploads of a tenant that are checked at a time, each with some pieces of its object in memory, and that
 /// may wait for it.
 const FINISHES: [usize; 2] = [4, 64];
+/// Digits of a digest with which names of its uploads begin.
+const PREFIX: usize = 2;
 /// Pause between two attempts to delete an object.
 const DELETE_EVERY: Duration = Duration::from_secs(60);
 
@@ -72,6 +74,14 @@ impl Finishes {
     }
 }
 
+/// A name that nobody can guess. It is as long as a digest, which names an upload elsewhere, and begins like
+/// that of the blob: both are counted in the same row of a database. A transaction that changed two could
+/// wait for another one that waits for it.
+fn name_for(digest: &str) -> String {
+    let random = format!("{}{}", Uuid::new_v4().simple(), Uuid::new_v4().simple());
+    format!("{}{}", &digest[..PREFIX], &random[PREFIX..])
+}
+
 fn path_of(upload: &str) -> ObjectPath {
     ObjectPath::from_iter(["direct", upload])
 }
@@ -98,8 +108,7 @@ impl BlobStore {
         if self.signed.lock().unwrap_or_else(PoisonError::into_inner).len() >= MOST_SIGNED {
             return Ok(None);
         }
-        // As long as a digest, which names an upload elsewhere. Nobody can guess it.
-        let upload = format!("{}{}", Uuid::new_v4().simple(), Uuid::new_v4().simple());
+        let upload = name_for(&blob.digest);
         let Some(request) = signing.to_write(&path_of(&upload), blob.bytes).await else { return Ok(None) };
         let claim = WriteClaim::take(self, &upload)?;
         self.reserve(&claim, blob.bytes, 0, limit_bytes, None).await?;
@@ -131,7 +140,9 @@ impl BlobStore {
         limit_bytes: Option<u64>,
     ) -> Result<(), ObjectError> {
         check_digest(&blob.digest)?;
-        check_digest(upload).map_err(|_| ObjectError::NoUpload)?;
+        if check_digest(upload).is_err() || upload[..PREFIX] != blob.digest[..PREFIX] {
+            return Err(ObjectError::NoUpload);
+        }
         let (store, blob, upload) = (Arc::clone(self), blob.clone(), upload.to_owned());
         let finished = tokio::spawn(async move {
             let Place::Bucket(bucket) = &store.place else { return Err(ObjectError::NoUpload) };

@@ -113,21 +113,23 @@ async fn a_client_sends_no_other_length_and_not_beyond_a_limit() {
     }
     let missing = store.finish_write(&blob, &write.upload, None).await.unwrap_err();
     assert!(matches!(missing, ObjectError::NoUpload), "{missing}");
-    for upload in ["", "../cas/00", &"0".repeat(64)] {
+    let of_other = signed(&store, &BlobRef::of(&[6; BYTES])).await.upload;
+    assert_ne!(of_other[..2], blob.digest[..2]);
+    for upload in ["", "../cas/00", &"0".repeat(64), &of_other] {
         let missing = store.finish_write(&blob, upload, None).await.unwrap_err();
         assert!(matches!(missing, ObjectError::NoUpload), "{upload}: {missing}");
     }
 
-    // The first one counts as long as its client can send it.
-    let limit = Some(2 * blob.bytes + 1);
+    // Those two count as long as their client can send them.
+    let limit = Some(3 * blob.bytes + 1);
     let first = store.sign_write(&blob, limit).await.unwrap().unwrap();
     let refused = store.sign_write(&BlobRef::of(&[9; BYTES]), limit).await.err().expect("a second one");
-    assert!(matches!(refused, ObjectError::OverLimit { used_bytes: 600_000, .. }), "{refused}");
+    assert!(matches!(refused, ObjectError::OverLimit { used_bytes: 900_000, .. }), "{refused}");
     // Sending it here counts instead of it, as long as it lasts.
     let through = store.begin_write(&blob, 0, limit).await.unwrap().unwrap();
-    assert_eq!(store.used_bytes().await.unwrap(), 2 * blob.bytes);
+    assert_eq!(store.used_bytes().await.unwrap(), 3 * blob.bytes);
     through.pause().await.unwrap();
-    assert_eq!(store.used_bytes().await.unwrap(), 2 * blob.bytes, "it counts no longer");
+    assert_eq!(store.used_bytes().await.unwrap(), 3 * blob.bytes, "it counts no longer");
     sent(&first, &content).await.unwrap();
     store.finish_write(&blob, &first.upload, limit).await.unwrap();
 

@@ -95,6 +95,26 @@ async fn what_one_coordinator_signs_another_finishes() {
 }
 
 #[tokio::test]
+async fn many_direct_uploads_are_finished_at_once() {
+    let Some(place) = Place::new() else { return };
+    let both = [place.coordinator().await, place.coordinator().await];
+    let mut finished = Vec::new();
+    for number in 0..48_usize {
+        let mut content = content(300_000);
+        content[..8].copy_from_slice(&number.to_le_bytes());
+        let blob = BlobRef::of(&content);
+        let write = signed(&both[number % 2].blobs, &blob).await;
+        sent(&write, &content).await.unwrap();
+        let blobs = Arc::clone(&both[number / 2 % 2].blobs);
+        finished.push(tokio::spawn(async move { blobs.finish_write(&blob, &write.upload, None).await }));
+    }
+    for finished in finished {
+        finished.await.unwrap().unwrap();
+    }
+    assert_eq!(both[0].blobs.used_bytes().await.unwrap(), 48 * 300_000);
+}
+
+#[tokio::test]
 async fn two_coordinators_agree_on_blobs_uploads_and_bytes() {
     let Some(place) = Place::new() else { return };
     let [one, other] = [place.coordinator().await, place.coordinator().await];
