@@ -718,6 +718,26 @@ twelve_million() {
     fi
 }
 
+# Wall clock of 32 cells on 1, 2 and 4 workers, as a share of the best schedule of their task times.
+parallel() {
+    local workers wall share
+    scripts/parallel.py --json >"$out/parallel.json" || {
+        case $? in
+            3) printf 'accept: 1, 2 and 4 workers were not checked: no control groups\n' >&2 ;;
+            *) miss "no measurement of 1, 2 and 4 workers" ;;
+        esac
+        return 0
+    }
+    python3 -c 'import json, sys
+for run in json.load(open(sys.argv[1]))["runs"]:
+    print(run["workers"], run["wall"], run["share"])' "$out/parallel.json" >"$out/parallel.txt"
+    while read -r workers wall share; do
+        row "synth/$workers workers" "scripts/parallel.py" "$(round "$wall") s, $(round "$share") of the best schedule" \
+            "wall_s=$wall" "share=$share"
+        at_least "$share" 0.95 || miss "$workers workers need $(round "$wall") s, $(round "$share") of the best schedule"
+    done <"$out/parallel.txt"
+}
+
 # Every driver that a CPU runs: a row for each driver and part.
 drivers() { # parts of scripts/drivers.sh, default all but memory
     local driver part result text
@@ -738,7 +758,7 @@ demo() {
 
 all='plans plan_scale merge_scale partitions readers demo fox other_programs speed step vksplat quality_for_time reef_360 fox_moments reef wreck water water_long sparse_waters other_waters viewer_colours reef_water
 open_water fox_long wreck_full
-twelve_million drivers memory_1m'
+twelve_million parallel drivers memory_1m'
 for figure in ${1:-$all}; do
     "$figure"
 done

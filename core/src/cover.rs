@@ -234,7 +234,7 @@ pub struct CoverReport {
 }
 
 /// A sum over pixels, and the number of pixels.
-#[derive(Clone, Copy, Default)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 struct Share {
     sum: f64,
     pixels: f64,
@@ -258,7 +258,7 @@ impl Share {
     }
 }
 
-#[derive(Clone, Copy, Default)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 struct Sums {
     holes: Share,
     /// Mean linear light over the channels.
@@ -273,34 +273,29 @@ impl Sums {
     }
 }
 
-/// Measures view after view.
-pub struct CoverMeter<'a> {
-    trained: Trained<'a>,
+/// All that was measured, from which a [`CoverReport`] follows. Several workers measure a part of the views
+/// each; appended in the order of the views, their sums give the report of all views.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct CoverSums {
+    /// Each view, in the order of measuring.
     views: Vec<Sums>,
     /// Histogram of the brightest channel of J, 8-bit sRGB.
-    brightest: [u64; 256],
+    brightest: Vec<u64>,
 }
 
-impl<'a> CoverMeter<'a> {
-    /// A meter without measurements. `views` are the cameras and poses (world to camera) of all views of the
-    /// scene by name, as the tracks of `points` number them. All except those with an index in `held_out`
-    /// count as training views.
-    pub fn new(views: &[(PinholeCamera, Pose)], held_out: &[u32], points: &'a Points) -> Self {
-        Self { trained: Trained::new(views, held_out, points), views: Vec::new(), brightest: [0; 256] }
+impl CoverSums {
+    /// Number of measured views.
+    pub fn views(&self) -> usize {
+        self.views.len()
     }
 
-    /// Measures one view.
-    pub fn add(&mut self, view: &HeldOut<'_>) {
-        let mut sums = Sums::default();
-        if !self.trained.eyes.is_empty() {
-            let near = self.trained.near(view.pose.centre());
-            sums.holes = self.holes(view, &near);
-            sums.unseen = unseen(view, &near);
+    /// Adds what was measured on later views.
+    pub fn append(&mut self, later: Self) {
+        self.views.extend(later.views);
+        self.brightest.resize(self.brightest.len().max(later.brightest.len()), 0);
+        for (mine, theirs) in self.brightest.iter_mut().zip(later.brightest) {
+            *mine = mine.saturating_add(theirs);
         }
-        if let Some(clear) = view.clear {
-            sums.open_water = self.open_water(view, clear);
-        }
-        self.views.push(sums);
     }
 
     /// The results, with the views in the order in which they were added.
@@ -314,6 +309,58 @@ impl<'a> CoverMeter<'a> {
         }
         let views = self.views.iter().map(|view| view.numbers(white)).collect();
         CoverReport { all: all.numbers(white), views }
+    }
+
+    /// J's white, linear light, above 0.
+    fn white(&self) -> Option<f64> {
+        let all: u64 = self.brightest.iter().copied().fold(0, u64::saturating_add);
+        let mut below = 0_u64;
+        let reached = |count: &u64| {
+            below = below.saturating_add(*count);
+            below > 0 && below as f64 >= WHITE * all as f64
+        };
+        let code = self.brightest.iter().position(reached)?;
+        (code > 0).then(|| srgb_to_linear(code as f64 / 255.0))
+    }
+}
+
+/// Measures view after view.
+pub struct CoverMeter<'a> {
+    trained: Trained<'a>,
+    sums: CoverSums,
+}
+
+impl<'a> CoverMeter<'a> {
+    /// A meter without measurements. `views` are the cameras and poses (world to camera) of all views of the
+    /// scene by name, as the tracks of `points` number them. All except those with an index in `held_out`
+    /// count as training views.
+    pub fn new(views: &[(PinholeCamera, Pose)], held_out: &[u32], points: &'a Points) -> Self {
+        let sums = CoverSums { views: Vec::new(), brightest: vec![0; 256] };
+        Self { trained: Trained::new(views, held_out, points), sums }
+    }
+
+    /// Measures one view.
+    pub fn add(&mut self, view: &HeldOut<'_>) {
+        let mut sums = Sums::default();
+        if !self.trained.eyes.is_empty() {
+            let near = self.trained.near(view.pose.centre());
+            sums.holes = self.holes(view, &near);
+            sums.unseen = unseen(view, &near);
+        }
+        if let Some(clear) = view.clear {
+            sums.open_water = self.open_water(view, clear);
+        }
+        self.sums.views.push(sums);
+    }
+
+    /// All that was measured, with the views in the order in which they were added.
+    pub fn sums(self) -> CoverSums {
+        self.sums
+    }
+
+    /// The results of [`CoverMeter::sums`].
+    pub fn report(self) -> CoverReport {
+        self.sums.report()
     }
 
     fn holes(&self, view: &HeldOut<'_>, near: &[&Eye]) -> Share {
@@ -345,22 +392,10 @@ impl<'a> CoverMeter<'a> {
                 let sum: f64 = [r, g, b].iter().map(|code| light[usize::from(*code)]).sum();
                 open.add(Share { sum: sum / 3.0, pixels: 1.0 });
             } else if view.alpha[pixel] > WHITE_ALPHA {
-                self.brightest[usize::from(r.max(g).max(b))] += 1;
+                self.sums.brightest[usize::from(r.max(g).max(b))] += 1;
             }
         }
         open
-    }
-
-    /// J's white, linear light, above 0.
-    fn white(&self) -> Option<f64> {
-        let all: u64 = self.brightest.iter().sum();
-        let mut below = 0;
-        let reached = |count: &u64| {
-            below += count;
-            below > 0 && below as f64 >= WHITE * all as f64
-        };
-        let code = self.brightest.iter().position(reached)?;
-        (code > 0).then(|| srgb_to_linear(code as f64 / 255.0))
     }
 }
 

@@ -17,7 +17,20 @@ pub fn attempt_span(job: &str, task: &str, attempt: u32, worker: &str) -> Span {
     span
 }
 
-/// "partition-0003" and "first_part-0003" belong to partition 3.
+/// "partition-0003" and "first_part-0003" belong to partition 3, "evaluate-0003" to none.
 fn partition_of(task: &str) -> Option<u32> {
-    task.split_once('-')?.1.parse().ok()
+    let (stage, number) = task.split_once('-')?;
+    ["partition", "first_part"].contains(&stage).then(|| number.parse().ok())?
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_tasks_of_partitions_have_one() {
+        let found =
+            ["partition-0003", "first_part-0012", "evaluate-0003", "merge", "partition-x"].map(partition_of);
+        assert_eq!(found, [Some(3), Some(12), None, None, None]);
+    }
 }

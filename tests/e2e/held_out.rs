@@ -1,5 +1,7 @@
 //! Metrics on held-out views during training, end to end with real processes.
 
+use std::collections::BTreeMap;
+
 use crate::processes::{can_train, fail, json, output_of, succeed, under};
 use serde_json::Value;
 
@@ -83,4 +85,54 @@ fn measuring_without_held_out_views_is_refused() {
     let out = under(folder.path(), "out");
     let (_, said) = fail(&["train", &scene, "-o", &out, "--test-every", "0", "--eval-every", "10"]);
     assert!(said.contains("train.eval_every needs held-out views"), "{said}");
+}
+
+/// The files of a folder by name.
+fn files(folder: &str) -> BTreeMap<String, Vec<u8>> {
+    let entries = std::fs::read_dir(folder).expect("a folder").map(|entry| entry.expect("an entry"));
+    entries
+        .map(|file| {
+            let name = file.file_name().to_string_lossy().into_owned();
+            (name, std::fs::read(file.path()).expect("a file"))
+        })
+        .collect()
+}
+
+#[test]
+fn an_evaluation_in_parts_changes_no_metric_and_no_picture() {
+    if !can_train("an_evaluation_in_parts_changes_no_metric_and_no_picture") {
+        return;
+    }
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let scene = crate::processes::tiny_scene(folder.path());
+    let results = ["1000", "3"].map(|views| {
+        let out = under(folder.path(), views);
+        let parts = format!("partition.evaluation_views={views}");
+        let settings = ["--partitions", "2x2", "--workers", "2", "--set", &parts];
+        let (mut metrics, model, _) = train(&scene, &out, &settings);
+        metrics["seconds"].take();
+        metrics["partitions"].as_array_mut().expect("partitions").iter_mut().for_each(|partition| {
+            partition["seconds"].take();
+        });
+        let run: Value = serde_json::from_slice(&std::fs::read(format!("{out}/run.json")).expect("run.json"))
+            .expect("JSON");
+        let tasks = run["tasks"].as_array().expect("tasks").iter();
+        let names: Vec<String> = tasks
+            .filter_map(|task| task["id"].as_str())
+            .filter(|task| task.starts_with("evaluate"))
+            .map(str::to_owned)
+            .collect();
+        (names, metrics, model, files(&format!("{out}/renders")))
+    });
+    let [(one, metrics, model, renders), (several, others, other_model, other_renders)] = results;
+    assert_eq!(one, ["evaluate"]);
+    assert_eq!(several, ["evaluate-0001", "evaluate-0002", "evaluate-0003"], "8 views, at most 3 in a task");
+    assert!(model == other_model, "another model");
+    assert_eq!(metrics, others);
+    assert!(metrics["seams"].is_object() && metrics["picture_gains"].is_array(), "{metrics:#}");
+    let names = |files: &BTreeMap<String, Vec<u8>>| files.keys().cloned().collect::<Vec<_>>();
+    assert_eq!(names(&renders), names(&other_renders));
+    for (name, picture) in &renders {
+        assert!(other_renders[name] == *picture, "{name} differs");
+    }
 }

@@ -2,7 +2,8 @@
 
 use std::path::Path;
 
-use crate::harness::{Harness, flip_a_bit};
+use crate::files::flip_a_bit;
+use crate::harness::Harness;
 use crate::process::Process;
 use crate::processes::can_train;
 use crate::reference::{self, scene};
@@ -66,7 +67,7 @@ fn an_upload_of_a_killed_client_is_resumed() {
     let job = harness.watch(job);
     job.wait_for("a plan", |event| event["task"] == "plan" && event["state"] == "done");
     assert_eq!(harness.partial_uploads().len(), 0, "a partial upload remains");
-    harness.check_data_dir();
+    harness.check_what_is_kept();
 }
 
 #[test]
@@ -95,6 +96,8 @@ fn a_download_leaves_no_half_file_and_no_damaged_one() {
     assert!(!half.exists());
 
     // The model is damaged on the coordinator's disk and is not served anywhere.
+    harness.check_what_is_kept();
+    harness.start_coordinator();
     let rotten = |path: &&std::path::PathBuf| std::fs::read(path).is_ok_and(|b| b == reference::model());
     flip_a_bit(harness.blobs().iter().find(rotten).expect("the model"));
     let elsewhere = harness.path("elsewhere");
@@ -129,7 +132,7 @@ fn a_job_cancelled_during_its_merge_stays_cancelled() {
     harness.succeeded(&next);
     drop(readers);
     assert_eq!(harness.show(&job.id)["state"], "cancelled");
-    harness.check_data_dir();
+    harness.check_what_is_kept();
 }
 
 #[test]

@@ -1,5 +1,6 @@
 //! Killed databases, buckets that fail, and coordinators whose jobs and files are in them.
 
+use std::path::Path;
 use std::time::{Duration, Instant};
 
 use crate::cut::Cut;
@@ -7,6 +8,7 @@ use crate::harness::Harness;
 use crate::processes::{can_train, output_of};
 use crate::reference;
 use crate::s3::Fault;
+use crate::small_disk::wait_for;
 
 #[test]
 fn a_database_killed_twice_in_a_job_costs_no_task() {
@@ -29,7 +31,7 @@ fn a_database_killed_twice_in_a_job_costs_no_task() {
     for said in ["the database is not available; calls are refused", "the database is available again"] {
         assert!(log.contains(said), "{said}: {log}");
     }
-    harness.check_data_dir();
+    harness.check_what_is_kept();
 }
 
 #[test]
@@ -55,7 +57,7 @@ fn a_bucket_that_fails_costs_no_task() {
     assert_eq!(history.losses(), 0, "a live worker was counted as lost\n{history}");
     let (requests, faults) = harness.bucket().requests();
     println!("{faults} of {requests} requests to the bucket failed");
-    harness.check_data_dir();
+    harness.check_what_is_kept();
 }
 
 #[test]
@@ -77,7 +79,7 @@ fn one_of_two_coordinators_is_killed_for_good() {
     for task in ["plan", "partition-0000", "partition-0001", "merge"] {
         assert!(lines.contains(task), "the log lacks the lines of {task}: {lines}");
     }
-    harness.check_data_dir();
+    harness.check_what_is_kept();
 }
 
 #[test]
@@ -96,19 +98,22 @@ fn a_coordinator_cut_off_from_its_database_sends_workers_on() {
     harness.start_worker_at("far", &addresses, &reference::cache());
     let job = harness.submit();
     job.wait_for_checkpoint("partition-0000");
-    let before = harness.log_of("second").len();
+    let before = harness.log_of("second-coordinator").len();
     network.set(true);
     harness.succeeded(&job);
-    let log = harness.log_of("second");
-    assert!(log[before..].contains("clients are sent to other coordinators"), "{log}");
+    // The job may end before the coordinator has waited long enough for its database.
+    wait_for("the coordinator to send its clients on", || {
+        let log = harness.log_of("second-coordinator");
+        log[before..].contains("clients are sent to other coordinators").then_some(())
+    });
 
     network.set(false);
     let deadline = Instant::now() + Duration::from_secs(60);
     while !output_of(&["ls", "--coordinator", &second]).status.success() {
-        assert!(Instant::now() < deadline, "it admits nobody:\n{}", harness.log_of("second"));
+        assert!(Instant::now() < deadline, "it admits nobody:\n{}", harness.log_of("second-coordinator"));
         std::thread::sleep(Duration::from_millis(200));
     }
-    harness.check_data_dir();
+    harness.check_what_is_kept();
 }
 
 #[test]
@@ -131,7 +136,7 @@ fn a_coordinator_dies_in_a_merge_and_another_merges() {
     harness.kill_coordinator();
     let history = harness.succeeded(&job);
     assert_eq!((history.losses(), history.leases("merge").len()), (0, 2), "{history}");
-    harness.check_data_dir();
+    harness.check_what_is_kept();
 }
 
 #[test]
@@ -152,4 +157,32 @@ fn a_coordinator_serves_only_the_jobs_of_its_files() {
     harness.start_coordinator();
     harness.start_worker("first");
     harness.conclude(&job);
+}
+
+#[test]
+fn a_dump_and_a_later_copy_of_the_bucket_are_one_backup() {
+    let scenario = "a_dump_and_a_later_copy_of_the_bucket_are_one_backup";
+    if !can_train(scenario) {
+        return;
+    }
+    let Some(mut harness) = Harness::on_database(scenario) else { return };
+    let (dump, copy) = (harness.path("dump.sql"), harness.path("bucket"));
+    harness.start_worker("first");
+    let job = harness.submit();
+    job.wait_for_checkpoint("partition-0000");
+    let (server, url) = harness.database();
+    server.dump(url, Path::new(&dump));
+    // The job goes on: checkpoints are replaced, and files come that the dump does not know.
+    harness.succeeded(&job);
+    harness.copy_bucket(Path::new(&copy));
+
+    let restored = Harness::restored(scenario, Path::new(&dump), Path::new(&copy));
+    let mut restored = restored.expect("there was a database");
+    let again = restored.watch(job.id.clone());
+    restored.start_worker("second");
+    let history = restored.conclude(&again);
+    let leases = history.leases("partition-0000");
+    assert_eq!((leases.len(), leases[0].worker.as_str()), (2, "first"), "{history}");
+    assert!(leases[1].resumed_from > 0, "the checkpoint of the dump was not used\n{history}");
+    harness.check_what_is_kept();
 }

@@ -2,7 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
-use crate::harness::{Harness, Rules, flip_a_bit};
+use crate::files::flip_a_bit;
+use crate::harness::{Harness, Rules};
 use crate::process::Process;
 use crate::processes::can_train;
 use crate::small_disk::{SmallDisk, wait_for};

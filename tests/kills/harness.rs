@@ -2,19 +2,26 @@
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::process::Output;
+use std::process::{Command, Output};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
+use fathom_coordinator::objects::TenantBlobs;
+use fathom_coordinator::schedule::{JobId, Tenant};
+use fathom_core::scene::BlobRef;
+use fathom_invariants::Fact;
 use serde_json::Value;
 
-use crate::history::{Acknowledged, History};
+use crate::files::{copy, files_in};
+use crate::history::{History, seen};
+use crate::job::Job;
 use crate::postgres::{Disk, Server};
 use crate::process::{Process, Random};
-use crate::processes::{free_port, output_in, output_of, under};
+use crate::processes::{fathom, fathom_of, free_port, output_of, under};
 use crate::reference;
 use crate::s3::S3Server;
-use crate::small_disk::wait_for;
+
+mod kept;
 
 /// Number of lines of each log shown on a failure.
 const LAST_LINES: usize = 14;
@@ -47,6 +54,8 @@ pub struct Harness {
     pub data: PathBuf,
     pub port: u16,
     pub rules: Rules,
+    /// The program of coordinators and workers that are started from now on; `None`: that of this build.
+    pub program: Option<PathBuf>,
     coordinator: Option<Process>,
     /// The port of a second one on the same database and bucket, and the process once it is started.
     second: Option<(u16, Option<Process>)>,
@@ -55,16 +64,19 @@ pub struct Harness {
     /// The server of its files; without one, they are in the data directory.
     bucket: Option<S3Server>,
     workers: BTreeMap<String, Process>,
-    jobs: Vec<String>,
+    /// What its clients were answered, by the time since its start.
+    facts: Vec<(Duration, Fact)>,
+    begin: Instant,
+    /// Number of watched jobs, of those that have ended, and of those that have succeeded.
+    watched: usize,
+    ended: usize,
+    succeeded: usize,
     /// Killed processes.
     pub kills: u32,
 }
 
-/// A job, and all events of its watcher from the start, across restarts.
-pub struct Job {
-    pub id: String,
-    watch: Mutex<Process>,
-    seen: Arc<Mutex<Vec<(Instant, Value)>>>,
+fn job_id(id: &str) -> JobId {
+    id.parse().expect("a job's name")
 }
 
 /// The seed of this process, which `FATHOM_KILLS_SEED` sets.
@@ -89,14 +101,38 @@ impl Harness {
     /// The same with its jobs in a database of its own and its files in a bucket; `None` where PostgreSQL is
     /// missing.
     pub fn on_database(scenario: &'static str) -> Option<Self> {
+        Self::on_database_of(scenario, None)
+    }
+
+    /// The same with another version of the program.
+    pub fn on_database_of(scenario: &'static str, program: Option<PathBuf>) -> Option<Self> {
         let server = Server::start(Disk::Synced)?;
         let url = server.database();
         // Longer than a pool takes to connect again.
         let mut harness = Self::stopped(scenario, Rules { lease_ms: 3000, ..Rules::default() });
         harness.database = Some((server, url));
         harness.bucket = Some(S3Server::start());
+        harness.program = program;
         harness.start_coordinator();
         Some(harness)
+    }
+
+    /// A service of what another one had, on this machine: a dump of its database, and a copy of its bucket.
+    pub fn restored(scenario: &'static str, dump: &Path, bucket: &Path) -> Option<Self> {
+        let server = Server::start(Disk::Synced)?;
+        let url = server.restored(dump);
+        let mut harness = Self::stopped(scenario, Rules { lease_ms: 3000, ..Rules::default() });
+        let files = S3Server::start();
+        copy(bucket, &files.folder(PREFIX));
+        harness.database = Some((server, url));
+        harness.bucket = Some(files);
+        harness.start_coordinator();
+        Some(harness)
+    }
+
+    /// Copies all files of its bucket.
+    pub fn copy_bucket(&self, to: &Path) {
+        copy(&self.bucket().folder(PREFIX), to);
     }
 
     /// Starts no process yet.
@@ -111,12 +147,17 @@ impl Harness {
             folder,
             port: free_port(),
             rules,
+            program: None,
             coordinator: None,
             second: None,
             database: None,
             bucket: None,
             workers: BTreeMap::new(),
-            jobs: Vec::new(),
+            facts: Vec::new(),
+            begin: Instant::now(),
+            watched: 0,
+            ended: 0,
+            succeeded: 0,
             kills: 0,
         }
     }
@@ -170,12 +211,29 @@ impl Harness {
         let (first_port, first_data) = (self.port, self.data.clone());
         let first = self.coordinator.take();
         (self.port, self.data) = (port, self.folder.path().join("second-data"));
-        assert!(self.try_named("second"), "the second coordinator did not start");
+        assert!(self.try_named("second-coordinator"), "the second coordinator did not start");
         self.second = Some((port, self.coordinator.take()));
         (self.port, self.data, self.coordinator) = (first_port, first_data, first);
         if let (Some((_, url)), Some(first)) = (&mut self.database, of_first) {
             *url = first;
         }
+    }
+
+    /// Stops the first coordinator as its operator would, and starts it again.
+    pub fn restart_coordinator(&mut self) {
+        self.coordinator().ask_to_leave();
+        self.coordinator().end();
+        self.start_coordinator();
+    }
+
+    /// The same for the second one.
+    pub fn restart_second(&mut self) {
+        let (port, process) = self.second.take().expect("it was announced");
+        let mut process = process.expect("it was started");
+        process.ask_to_leave();
+        process.end();
+        self.second = Some((port, None));
+        self.start_second();
     }
 
     /// The address of the second coordinator.
@@ -208,10 +266,18 @@ impl Harness {
         ];
         arguments.extend(self.database.as_ref().map(|(_, url)| format!("--store={url}")));
         arguments.extend(self.bucket.as_ref().map(|bucket| format!("--objects={}", bucket.url(PREFIX))));
-        let mut process = Process::start_in(name, &arguments, &self.environment(), &self.log_folder());
+        let command = self.command(&arguments);
+        let mut process = Process::start_command(name, command, &self.environment(), &self.log_folder());
         let ready = process.line().is_some_and(|line| line.starts_with("listening on http://"));
         self.coordinator = Some(process);
         ready
+    }
+
+    fn command(&self, arguments: &[String]) -> Command {
+        match &self.program {
+            Some(program) => fathom_of(program, arguments),
+            None => fathom(arguments),
+        }
     }
 
     pub fn coordinator(&mut self) -> &mut Process {
@@ -281,7 +347,8 @@ impl Harness {
             format!("--name={name}"),
             format!("--cache-dir={}", cache.display()),
         ];
-        self.workers.insert(name.to_owned(), Process::start(name, &arguments, &self.log_folder()));
+        let process = Process::start_command(name, self.command(&arguments), &[], &self.log_folder());
+        self.workers.insert(name.to_owned(), process);
     }
 
     pub fn worker(&mut self, name: &str) -> &mut Process {
@@ -297,7 +364,12 @@ impl Harness {
 
     /// Runs a verb against the coordinator to its end.
     pub fn call(&self, words: &[&str]) -> Output {
-        output_of(&[words, &["--coordinator", &self.url()]].concat())
+        let url = self.url();
+        let words = [words, &["--coordinator", &url]].concat();
+        match &self.program {
+            Some(program) => fathom_of(program, &words).output().expect("the binary starts"),
+            None => output_of(&words),
+        }
     }
 
     /// The same; it must succeed.
@@ -344,7 +416,10 @@ impl Harness {
 
     /// Records an acknowledged job.
     pub fn watch(&mut self, id: String) -> Job {
-        self.jobs.push(id.clone());
+        let user = self.watched;
+        self.watched += 1;
+        let (request, job) = (id.clone(), job_id(&id));
+        self.note([Fact::Created { user, request, job }]);
         let words = ["watch", &id, "--json", "--coordinator", &self.url()].map(str::to_owned);
         let mut watch = Process::start(&format!("watch-{id}"), &words, &self.log_folder());
         let seen = Arc::<Mutex<Vec<(Instant, Value)>>>::default();
@@ -354,77 +429,59 @@ impl Harness {
                 sink.lock().unwrap_or_else(PoisonError::into_inner).push((Instant::now(), event));
             }
         });
-        Job { id, watch: Mutex::new(watch), seen }
+        Job { id, user, watch: Mutex::new(watch), seen }
     }
 
-    /// Waits for the given end state of a job, and checks its history.
+    fn note(&mut self, facts: impl IntoIterator<Item = Fact>) {
+        let now = self.begin.elapsed();
+        self.facts.extend(facts.into_iter().map(|fact| (now, fact)));
+    }
+
+    /// Waits for the given end state of a job, and records what was seen of it.
     pub fn ended(&mut self, job: &Job, state: &str) -> History {
         job.watch.lock().unwrap_or_else(PoisonError::into_inner).end();
         let shown = self.show(&job.id);
         assert_eq!(shown["state"], state, "{shown:#}");
-        let events = String::from_utf8_lossy(&self.call(&["watch", &job.id, "--json"]).stdout).into_owned();
-        let history = History::of(events.lines().filter_map(|line| serde_json::from_str(line).ok()));
-        let mut faults = history.faults(&shown, self.rules.max_losses);
-        faults.extend(history.differences(&job.seen()));
-        for (_, log) in
-            self.logs().iter().filter(|(name, _)| !["coordinator", "second"].contains(&name.as_str()))
-        {
-            faults.extend(history.lacks(&job.id, &Acknowledged::in_log(log)));
-        }
-        assert!(faults.is_empty(), "job {}: {faults:#?}\n{history}", job.id);
-        history
+        let printed = String::from_utf8_lossy(&self.call(&["watch", &job.id, "--json"]).stdout).into_owned();
+        let events: Vec<Value> = printed.lines().filter_map(|line| serde_json::from_str(line).ok()).collect();
+        self.note(seen(job.user, &job_id(&job.id), &job.seen(), false));
+        self.note(seen(job.user, &job_id(&job.id), &events, true));
+        self.ended += 1;
+        self.succeeded += usize::from(state == "succeeded");
+        History::of(events.into_iter())
     }
 
     /// The model of a job that has succeeded.
-    pub fn download(&self, job: &Job) -> Vec<u8> {
+    pub fn download(&mut self, job: &Job) -> Vec<u8> {
         let out = self.path(&format!("out-{}", job.id));
         self.ask(&["download", &job.id, "-o", &out]);
-        std::fs::read(format!("{out}/model.ply")).expect("a model")
+        let bytes = std::fs::read(format!("{out}/model.ply")).expect("a model");
+        let model = blake3::hash(&bytes).to_hex().to_string();
+        self.note([Fact::Fetched { user: job.user, job: job_id(&job.id), model }]);
+        bytes
     }
 
-    /// Waits until a job succeeds; its model must equal the undisturbed one, and its history must be valid.
+    /// Waits until a job succeeds; its model must equal the undisturbed one.
     pub fn succeeded(&mut self, job: &Job) -> History {
         let history = self.ended(job, "succeeded");
-        let acknowledged = self.logs().iter().flat_map(|(_, log)| Acknowledged::in_log(log)).count();
-        assert!(acknowledged > 0, "the worker logs hold no acknowledgements: has their format changed?");
         assert!(self.download(job) == reference::model(), "job {} has another model\n{history}", job.id);
         history
     }
 
-    /// As [`Harness::succeeded`]; then kills the coordinator a last time and checks its data directory.
-    pub fn conclude(mut self, job: &Job) -> History {
-        let history = self.succeeded(job);
-        self.check_data_dir();
-        history
-    }
-
-    /// Every acknowledged job is known, and all its blobs are intact.
-    pub fn check_data_dir(&mut self) {
-        for job in &self.jobs {
-            self.show(job);
-        }
-        // Processes that were already killed stay dead.
-        self.workers.clear();
-        self.second = None;
-        self.kill_coordinator();
-        let data = self.data.to_string_lossy().into_owned();
-        let mut verify = vec!["store", "verify", "--data-dir", &data, "--deep", "--json"];
-        if let Some((_, url)) = &self.database {
-            verify.extend(["--store", url]);
-        }
-        let objects = self.bucket.as_ref().map(|bucket| format!("--objects={}", bucket.url(PREFIX)));
-        verify.extend(objects.as_deref());
-        let found = output_in(&self.environment(), &verify);
-        let said = String::from_utf8_lossy(&found.stdout).into_owned();
-        assert!(found.status.success(), "the coordinator left damaged data: {said}");
-    }
-
     /// Jobs deleted by their user need not be known.
     pub fn forget(&mut self, job: &Job) {
-        self.jobs.retain(|id| *id != job.id);
+        let (user, job) = (job.user, job_id(&job.id));
+        self.note([Fact::Deleting { user, job: job.clone() }, Fact::Deleted { user, job }]);
+        self.ended += 1;
     }
 
     // Contents of the disk
+
+    /// The file of a blob, in the data directory or in the folder of the bucket.
+    fn blob(&self, tenant: &Tenant, blob: &BlobRef) -> PathBuf {
+        let root = self.bucket.as_ref().map_or_else(|| self.data.clone(), |bucket| bucket.folder(PREFIX));
+        TenantBlobs::folder(&root, tenant).join("cas").join(&blob.digest[..2]).join(&blob.digest)
+    }
 
     /// Complete blobs, with their names.
     pub fn blobs(&self) -> Vec<PathBuf> {
@@ -476,94 +533,4 @@ impl Drop for Harness {
             "--- scenario {scenario}; again: FATHOM_KILLS_SEED={seed} cargo test --test kills {scenario}"
         );
     }
-}
-
-impl Job {
-    /// The events that its watcher has received.
-    pub fn seen(&self) -> Vec<Value> {
-        let seen = self.seen.lock().unwrap_or_else(PoisonError::into_inner);
-        seen.iter().map(|(_, event)| event.clone()).collect()
-    }
-
-    /// Waits for an event, which may have arrived already.
-    pub fn wait_for(&self, what: &str, is_it: impl Fn(&Value) -> bool) -> Value {
-        self.wait_after(0, what, is_it).1
-    }
-
-    /// Waits for an event after the first `after`; returns the number of events up to it, its time, and the
-    /// event.
-    pub fn wait_after(&self, after: usize, what: &str, is_it: impl Fn(&Value) -> bool) -> (usize, Value) {
-        let mut looked_at = after;
-        wait_for(what, || {
-            let seen = self.seen.lock().unwrap_or_else(PoisonError::into_inner);
-            let found = seen.iter().enumerate().skip(looked_at).find(|(_, (_, event))| is_it(event));
-            looked_at = seen.len().max(after);
-            found.map(|(index, (_, event))| (index + 1, event.clone()))
-        })
-    }
-
-    /// Whether its watcher has seen its end.
-    pub fn is_over(&self) -> bool {
-        self.watch.lock().unwrap_or_else(PoisonError::into_inner).ended().is_some()
-    }
-
-    /// Time from the last saved state of an attempt (its checkpoint, or else its lease) until `end`, as the
-    /// watcher saw it.
-    pub fn lost_work(&self, task: &str, attempt: u64, end: Instant) -> Option<Duration> {
-        let seen = self.seen.lock().unwrap_or_else(PoisonError::into_inner);
-        let is_safe = |event: &Value| {
-            event["task"] == task
-                && event["attempt"] == attempt
-                && (event["state"] == "running" || event["event"] == "checkpoint")
-        };
-        let safe = seen.iter().rfind(|(when, event)| *when <= end && is_safe(event));
-        safe.map(|(when, _)| end.duration_since(*when))
-    }
-
-    /// Time at which the watcher first saw an attempt change to `state`.
-    pub fn when(&self, task: &str, attempt: u64, state: &str) -> Option<Instant> {
-        let seen = self.seen.lock().unwrap_or_else(PoisonError::into_inner);
-        let is_it =
-            |event: &Value| event["task"] == task && event["attempt"] == attempt && event["state"] == state;
-        seen.iter().find(|(_, event)| is_it(event)).map(|(when, _)| *when)
-    }
-
-    /// Progress of a task in the last report before `end`.
-    pub fn iteration(&self, task: &str, end: Instant) -> u64 {
-        let seen = self.seen.lock().unwrap_or_else(PoisonError::into_inner);
-        let reports = seen
-            .iter()
-            .filter(|(when, event)| *when <= end && event["task"] == task && event["event"] == "progress");
-        reports.filter_map(|(_, event)| event["iteration"].as_u64()).next_back().unwrap_or(0)
-    }
-
-    /// Waits until a worker has a task; returns the worker's name.
-    pub fn wait_until_leased(&self, task: &str) -> String {
-        let event = self.wait_for(&format!("a worker for {task}"), |event| {
-            event["task"] == task && event["state"] == "running"
-        });
-        event["worker"].as_str().expect("a name").to_owned()
-    }
-
-    /// Waits for the first checkpoint of a task; returns its iteration.
-    pub fn wait_for_checkpoint(&self, task: &str) -> u64 {
-        let event = self.wait_for(&format!("a checkpoint of {task}"), |event| {
-            event["task"] == task && event["event"] == "checkpoint"
-        });
-        event["iteration"].as_u64().expect("a number")
-    }
-}
-
-/// The entries of a folder; empty if it does not exist.
-pub fn files_in(folder: &Path) -> Vec<PathBuf> {
-    let entries = std::fs::read_dir(folder).into_iter().flatten();
-    entries.map_while(Result::ok).map(|entry| entry.path()).collect()
-}
-
-/// Flips one bit in the middle of a file.
-pub fn flip_a_bit(path: &Path) {
-    let mut bytes = std::fs::read(path).expect("a file");
-    let middle = bytes.len() / 2;
-    bytes[middle] ^= 1;
-    std::fs::write(path, bytes).expect("written");
 }

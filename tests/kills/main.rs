@@ -20,8 +20,10 @@ mod coordinators;
 mod cut;
 mod databases;
 mod disks;
+mod files;
 mod harness;
 mod history;
+mod job;
 mod process;
 mod reference;
 #[path = "../support/s3.rs"]
@@ -30,4 +32,5 @@ mod slow_link;
 #[path = "../support/small_disk.rs"]
 mod small_disk;
 mod soak;
+mod upgrade;
 mod workers;

@@ -26,9 +26,19 @@ impl Process {
 
     /// The same with more variables in its environment.
     pub fn start_in(name: &str, arguments: &[String], environment: &[(&str, String)], logs: &Path) -> Self {
+        Self::start_command(name, fathom(arguments), environment, logs)
+    }
+
+    /// The same with another version of the program.
+    pub fn start_command(
+        name: &str,
+        mut command: Command,
+        environment: &[(&str, String)],
+        logs: &Path,
+    ) -> Self {
         let log = logs.join(format!("{name}.log"));
         let file = File::options().create(true).append(true).open(&log).expect("a log");
-        let mut child = fathom(arguments)
+        let mut child = command
             .env("FATHOM_LOG", "info")
             .env("NO_COLOR", "1")
             .envs(environment.iter().map(|(name, value)| (name, value)))

@@ -62,6 +62,7 @@ pub fn model() -> &'static [u8] {
             assert_eq!(history.leases(task).len(), 1, "the undisturbed run was disturbed: {task}");
         }
         let model = harness.download(&job);
+        harness.check_what_is_kept();
         assert!(model.starts_with(b"ply\n") && model.len() > 50_000, "{} bytes", model.len());
         model
     })

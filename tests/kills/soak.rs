@@ -3,8 +3,9 @@
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
-use crate::harness::{Harness, Job};
+use crate::harness::Harness;
 use crate::history::History;
+use crate::job::Job;
 use crate::processes::can_train;
 use crate::reference::scene;
 use crate::s3::Fault;
@@ -118,7 +119,7 @@ fn kill_at_random(scenario: &'static str, harness: impl FnOnce() -> Option<Harne
         }
     }
     let kills = chaos.kills();
-    chaos.harness.check_data_dir();
+    chaos.harness.check_what_is_kept();
     println!("{rounds} jobs in {:.0?}, {kills} kills survived; {}", begin.elapsed(), chaos.figures.said());
 }
 

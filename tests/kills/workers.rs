@@ -3,7 +3,8 @@
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-use crate::harness::{Harness, Rules, files_in};
+use crate::files::files_in;
+use crate::harness::{Harness, Rules};
 use crate::history::{History, Leased};
 use crate::processes::can_train;
 use crate::slow_link::SlowLink;
@@ -189,7 +190,7 @@ fn a_worker_that_wakes_after_its_lease_changes_nothing() {
             || said.contains("the result is no longer needed"))
         .then_some(())
     });
-    harness.check_data_dir();
+    harness.check_what_is_kept();
 }
 
 #[test]

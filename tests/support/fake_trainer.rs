@@ -206,7 +206,7 @@ impl FakeTrainer {
             adapter,
             seams_json,
             cover_json,
-            clear_gains: Vec::new(),
+            ..Default::default()
         };
         Ok(TaskOutput {
             result: evaluation.encode_to_vec().into(),

@@ -144,6 +144,21 @@ impl Server {
         run(&mut psql)
     }
 
+    /// Writes the database of `url` as SQL, as its operators would.
+    pub fn dump(&self, url: &str, file: &Path) {
+        let sql = run(self.command("pg_dump").arg("--dbname").arg(url));
+        std::fs::write(file, sql).expect("written");
+    }
+
+    /// Creates a database of what [`Self::dump`] wrote; returns its URL.
+    pub fn restored(&self, file: &Path) -> String {
+        let url = self.database();
+        let sql = std::fs::File::open(file).expect("a dump");
+        let mut psql = self.command("psql");
+        run(psql.args(["-q", "-v", "ON_ERROR_STOP=1", "-d", &url]).stdin(sql));
+        url
+    }
+
     fn data(&self) -> PathBuf {
         self.dir.path().join("data")
     }
@@ -180,7 +195,9 @@ impl Drop for Server {
 /// The folder of the server's programs: on the PATH, or where Debian puts the newest version.
 fn bin() -> Option<PathBuf> {
     let has_all = |bin: &Path| {
-        ["initdb", "postgres", "createdb", "pg_isready", "psql"].iter().all(|name| bin.join(name).is_file())
+        ["initdb", "postgres", "createdb", "pg_isready", "pg_dump", "psql"]
+            .iter()
+            .all(|name| bin.join(name).is_file())
     };
     let path = std::env::var_os("PATH").unwrap_or_default();
     if let Some(bin) = std::env::split_paths(&path).find(|bin| has_all(bin)) {

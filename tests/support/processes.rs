@@ -12,7 +12,12 @@ use serde_json::Value;
 
 /// `fathom` with `arguments`, without FATHOM variables of the tester's environment.
 pub fn fathom<S: AsRef<str>>(arguments: &[S]) -> Command {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_fathom"));
+    fathom_of(Path::new(env!("CARGO_BIN_EXE_fathom")), arguments)
+}
+
+/// The same with another version of the program.
+pub fn fathom_of<S: AsRef<str>>(program: &Path, arguments: &[S]) -> Command {
+    let mut command = Command::new(program);
     // Variables for tests and logs stay.
     let is_setting =
         |name: &str| name.starts_with("FATHOM_") && !name.starts_with("FATHOM_TEST_") && name != "FATHOM_LOG";

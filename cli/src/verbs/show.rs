@@ -164,7 +164,7 @@ pub fn job_json(job: &Job) -> Value {
 }
 
 fn is_per_partition(stage: Stage) -> bool {
-    schedule::Stage::from_proto(stage).is_some_and(|stage| stage.spec().per_partition)
+    schedule::Stage::from_proto(stage).is_some_and(schedule::Stage::is_per_partition)
 }
 
 fn task_json(task: &Task) -> Value {

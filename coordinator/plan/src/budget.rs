@@ -45,17 +45,21 @@ pub struct Content<'a> {
     pub frozen: (&'a [DVec3], u64),
 }
 
-/// The run of the coarse model on these views, with images of half the size of the partitions'.
+/// The run of the coarse model on these views, with images of half the size of the partitions'. One worker
+/// trains it while all others wait, so it has a bound that does not grow with the scene.
 pub fn global_stage(
     config: &JobConfig,
     max_resolution: u32,
     views: &[(PinholeCamera, Pose)],
     points: &[DVec3],
 ) -> GlobalStage {
-    let max_gaussians = max_gaussians(config, config.partition.global_gaussians);
+    let partition = &config.partition;
+    let max_gaussians =
+        max_gaussians(config, partition.global_gaussians).min(partition.global_most_gaussians);
     let of_job = config.train.iterations;
-    let least = config.partition.global_least_iterations.min(of_job);
-    let iterations = share_of(of_job, config.partition.global_iterations, MIN_ITERATIONS).max(least);
+    let least = partition.global_least_iterations.min(of_job);
+    let share = share_of(of_job, partition.global_iterations, MIN_ITERATIONS);
+    let iterations = share.min(partition.global_most_iterations).max(least);
     let run = TrainConfig { iterations, ..config.train.clone() };
     let content = Content { views, trained: (points, max_gaussians.into()), frozen: (&[], 0) };
     GlobalStage {
@@ -187,6 +191,14 @@ mod tests {
             global_stage(&config, 240, &pictures(3, 240, 180), &[]).iterations
         };
         assert_eq!([iterations(600), iterations(2000), iterations(8000)], [600, 1000, 2000]);
+    }
+
+    #[test]
+    fn the_global_stage_does_not_grow_with_the_scene() {
+        let mut config = JobConfig::default();
+        (config.train.iterations, config.train.max_gaussians) = (20_000_000, 2_000_000_000);
+        let stage = global_stage(&config, 240, &pictures(3, 240, 180), &[]);
+        assert_eq!((stage.iterations, stage.max_gaussians), (30_000, 4_000_000));
     }
 
     #[test]

@@ -12,6 +12,7 @@ use prost::Message;
 use super::calls::blob;
 use crate::datasets::{FileList, ListedFile};
 use crate::own_tasks::artifacts::{self, ArtifactIndex};
+use crate::own_tasks::evaluation::Evaluated;
 use crate::own_tasks::exchange;
 use crate::own_tasks::input::JobInput;
 use crate::schedule::TaskId;
@@ -177,16 +178,35 @@ fn fuzzed_measurements_of_workers_are_taken_or_refused() {
     };
     let read = |bytes: &[u8]| {
         let Ok(evaluation) = v1::Evaluation::decode(bytes) else { return false };
-        if artifacts::seam_report(&evaluation).is_err() || artifacts::cover_report(&evaluation).is_err() {
+        let views = evaluation.views.len();
+        let Ok(evaluated) = (match evaluation.cover_sums_json.is_empty() {
+            true => Evaluated::of_one(evaluation),
+            false => Evaluated::of_parts(vec![(evaluation, views)]),
+        }) else {
             return false;
-        }
-        for (index, metrics) in evaluation.views.iter().enumerate() {
+        };
+        for (index, metrics) in evaluated.views.iter().enumerate() {
             let path = artifacts::render_path("border_", index, &metrics.name);
             assert_eq!(fathom_core::paths::check_inside(&path), Ok(()), "{path:?}");
         }
         true
     };
-    run(&Target::new("Evaluation", vec![evaluation.encode_to_vec()], &read));
+    let zone = r#"{"pixels": 9, "squares": 70, "ssim": 8.5}"#;
+    let seams = format!(
+        r#"{{"border": {zone}, "border_flank": {zone}, "control": {zone}, "control_flank": {zone}, "interior": {zone}, "least": 1}}"#
+    );
+    let cover = r#"{"holes": {"sum": 1, "pixels": 9}, "open_water": {"sum": 1, "pixels": 9}, "unseen": {"sum": 1, "pixels": 9}}"#;
+    let steps = r#"[{"pairs": 2, "steps": [0.5, 0.25]}, {"pairs": 1, "steps": [0.125]}]"#;
+    let part = v1::Evaluation {
+        cover_json: String::new(),
+        seam_sums_json: format!(
+            r#"{{"band": 0.5, "views": [{seams}, {seams}], "border_steps": {steps}, "control_steps": {steps}}}"#
+        ),
+        cover_sums_json: format!(r#"{{"views": [{cover}, {cover}], "brightest": [1, 2, 3]}}"#),
+        ..evaluation.clone()
+    };
+    assert!(read(&part.encode_to_vec()), "a part of an evaluation");
+    run(&Target::new("Evaluation", vec![evaluation.encode_to_vec(), part.encode_to_vec()], &read));
 }
 
 #[test]

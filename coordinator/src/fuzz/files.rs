@@ -39,7 +39,7 @@ fn fuzzed_exports_of_a_store_are_imported_or_refused() {
     let mut sound = export::sample();
     // One that is planned, with its tasks.
     let planned = &mut sound.jobs[1];
-    planned.job.shape = JobShape { partitions: 2, stages: Stage::all().collect() };
+    planned.job.shape = JobShape { partitions: 2, evaluations: 2, stages: Stage::all().collect() };
     planned.tasks =
         planned.job.shape.tasks().into_iter().map(|task| TaskRecord::new(task, None, 7)).collect();
     let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();

@@ -4,30 +4,27 @@ use std::collections::HashMap;
 use std::sync::Arc;
 
 use bytes::Bytes;
-use fathom_core::cover::{self, CoverReport};
+use fathom_core::cover;
 use fathom_core::metrics::protocol;
 use fathom_core::paths::check_inside;
 use fathom_core::scene::{BlobRef, PinholeCamera, Pose};
-use fathom_core::seams::{self, SeamReport};
+use fathom_core::seams;
 use fathom_core::views::TrainView;
 use fathom_core::water::Consensus;
 use fathom_merge::ModelManifest;
 use fathom_plan::Plan;
-use fathom_proto::worker::v1::{Evaluation, ViewMetrics};
+use fathom_proto::worker::v1::ViewMetrics;
 use glam::{DMat3, DVec3};
-use prost::Message;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
+use super::evaluation::{self, Evaluated};
 use super::input::{JobInput, blocking, made, read_plan};
 use super::merge::MergeReport;
 use super::{OwnTaskError, exchange};
 use crate::objects::{BlobStore, ObjectError};
 use crate::schedule::{Artifact, HeldOut, JobRecord, Stage, TaskId, TaskOutput, TaskState, TaskStats};
 use crate::store::JobView;
-
-/// Longest evaluation, bytes: half a kB for each of some 100,000 held-out views.
-pub const MAX_EVALUATION_BYTES: u64 = 64 << 20;
 
 /// The index of the files. It is a separate blob, because a job can have thousands of renders.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -54,7 +51,8 @@ impl ArtifactIndex {
     }
 }
 
-fn unreadable(artifact: Artifact, blob: &BlobRef, error: &dyn std::error::Error) -> OwnTaskError {
+/// The error of an artifact that another version may have written.
+pub(super) fn unreadable(artifact: Artifact, blob: &BlobRef, error: &dyn std::error::Error) -> OwnTaskError {
     OwnTaskError::failed(format!(
         "the {} {} cannot be read: {error}; use one version of Fathom for the whole job",
         artifact.title(),
@@ -73,16 +71,8 @@ pub async fn assemble(objects: &Arc<BlobStore>, view: &JobView) -> Result<TaskOu
         .map_err(|e| unreadable(Artifact::MergeReport, report, &e))?;
     let input = JobInput::read(objects, job).await?;
     let plan = read_plan(objects, job).await?;
-    let evaluation = match job.output(Artifact::Evaluation) {
-        Some(blob) => Some(
-            Evaluation::decode(objects.read_at_most(blob, MAX_EVALUATION_BYTES).await?)
-                .map_err(|e| unreadable(Artifact::Evaluation, blob, &e))?,
-        ),
-        None => None,
-    };
+    let evaluation = evaluation::read(objects, view, plan.held_out.len()).await?;
     let views = input.views()?;
-    let seams = evaluation.as_ref().map(seam_report).transpose()?.flatten();
-    let cover = evaluation.as_ref().map(cover_report).transpose()?.flatten();
     let water = water_json(&report, exchange::read(objects, view).await?.as_ref());
 
     let mut files = vec![
@@ -95,9 +85,9 @@ pub async fn assemble(objects: &Arc<BlobStore>, view: &JobView) -> Result<TaskOu
         ("cameras.json", cameras_json(&views)),
         ("metrics.json", {
             let mut metrics = metrics_json(view, &input, &plan, &views, &report, evaluation.as_ref());
-            seams::put_into(&mut metrics, seams.as_ref());
-            cover::put_into(&mut metrics, cover.as_ref());
-            if let Some(gains) = evaluation.as_ref().and_then(clear_gains) {
+            seams::put_into(&mut metrics, evaluation.as_ref().and_then(|found| found.seams.as_ref()));
+            cover::put_into(&mut metrics, evaluation.as_ref().and_then(|found| found.cover.as_ref()));
+            if let Some(gains) = evaluation.as_ref().and_then(|found| found.clear_gains) {
                 metrics["picture_gains"] = serde_json::json!(gains);
             }
             metrics
@@ -145,32 +135,6 @@ async fn manifest_of(
         serde_json::to_vec(&manifest).map_err(|e| failed(e.to_string()))
     });
     Ok(objects.put(json.await?.into()).await?)
-}
-
-/// The seam report; `None` for a single partition.
-pub fn seam_report(evaluation: &Evaluation) -> Result<Option<SeamReport>, OwnTaskError> {
-    let text = Some(evaluation.seams_json.as_str()).filter(|text| !text.is_empty());
-    text.map(serde_json::from_str)
-        .transpose()
-        .map_err(|e| OwnTaskError::failed(format!("the evaluation's borders: {e}")))
-}
-
-/// Display gains of the images of J among the renders, linear light; `None` where there is no water.
-fn clear_gains(evaluation: &Evaluation) -> Option<[f64; 3]> {
-    evaluation
-        .clear_gains
-        .as_slice()
-        .try_into()
-        .ok()
-        .filter(|gains: &[f64; 3]| gains.iter().all(|g| g.is_finite()))
-}
-
-/// How well the model covers the held-out views; `None` if not measured.
-pub fn cover_report(evaluation: &Evaluation) -> Result<Option<CoverReport>, OwnTaskError> {
-    let text = Some(evaluation.cover_json.as_str()).filter(|text| !text.is_empty());
-    text.map(serde_json::from_str)
-        .transpose()
-        .map_err(|e| OwnTaskError::failed(format!("the evaluation's cover: {e}")))
 }
 
 /// Maximum length of a photograph's name in the name of its render: with number and extension it must be a
@@ -227,7 +191,7 @@ fn metrics_json(
     plan: &Plan,
     views: &[TrainView],
     report: &MergeReport,
-    evaluation: Option<&Evaluation>,
+    evaluation: Option<&Evaluated>,
 ) -> Value {
     let job = &view.job;
     let measured = evaluation.map_or(&[][..], |evaluation| &evaluation.views);

@@ -34,7 +34,7 @@ pub async fn exchange_results(objects: &Arc<BlobStore>, view: &JobView) -> Resul
     let mut results = Vec::new();
     let mut rows = BTreeMap::new();
     for (task, _) in &view.tasks {
-        let TaskId { stage, partition } = task.task;
+        let TaskId { stage, part: partition } = task.task;
         let (Stage::FirstPart, Some(partition), TaskState::Done { result, .. }) =
             (stage, partition, &task.state)
         else {

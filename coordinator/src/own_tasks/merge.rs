@@ -46,7 +46,7 @@ pub async fn merge_job(
     let mut results = Vec::with_capacity(plan.partitions.len());
     let mut handed_in = Vec::with_capacity(plan.partitions.len());
     for (task, _) in &view.tasks {
-        let TaskId { stage, partition } = task.task;
+        let TaskId { stage, part: partition } = task.task;
         if let (Stage::Partition, Some(index), TaskState::Done { result, .. }) =
             (stage, partition, &task.state)
         {

@@ -6,6 +6,7 @@
 
 pub mod artifacts;
 mod error;
+pub mod evaluation;
 pub mod exchange;
 pub mod input;
 mod merge;

@@ -14,6 +14,7 @@ use fathom_proto::worker::v1::{
 use prost::Message;
 
 use super::OwnTaskError;
+use super::evaluation::views_of_part;
 use super::input::{JobInput, blocking};
 use crate::objects::BlobStore;
 use crate::schedule::{JobRecord, Planned, PlannedTask, Stage, TaskId, TaskOutput};
@@ -75,12 +76,7 @@ pub async fn plan_job(
         // It holds the whole model, whose memory has no forecast.
         tasks.insert(Stage::Borders.task(), put_spec(objects, config.method, common, work, 0).await?);
     }
-    if !plan.held_out.is_empty() {
-        let seams = plan.seam_lines(&config.seams).as_ref().map(seam_lines);
-        let common = common_spec(&plan, &plan.held_out, config.data.max_resolution);
-        let work = Work::Evaluate(EvaluateSpec { seams });
-        tasks.insert(Stage::Evaluate.task(), put_spec(objects, config.method, common, work, 0).await?);
-    }
+    tasks.extend(put_evaluations(objects, &plan, &config).await?);
     tasks.extend([own(Stage::Merge), own(Stage::Artifacts)]);
     let (plan_blob, picture) = (objects.put(plan_json.into()).await?, objects.put(plan_png.into()).await?);
     Ok(TaskOutput::planned(plan_blob, picture, Planned { tasks, warnings }))
@@ -196,6 +192,31 @@ async fn put_partitions(
         }
         let rest = put_spec(objects, config.method, common, Work::Partition(work), memory_bytes).await?;
         tasks.insert(Stage::Partition.task_of(index), rest);
+    }
+    Ok(tasks)
+}
+
+/// The tasks that evaluate: one for all held-out views, or several for a part of them each. Their number
+/// follows from the scene alone, so that the same job has the same tasks with any workers.
+async fn put_evaluations(
+    objects: &BlobStore,
+    plan: &Plan,
+    config: &JobConfig,
+) -> Result<BTreeMap<TaskId, PlannedTask>, OwnTaskError> {
+    let (held_out, mut tasks) = (&plan.held_out, BTreeMap::new());
+    let seams = plan.seam_lines(&config.seams).as_ref().map(seam_lines);
+    // Each task fetches the merged model. A job with few partitions has few workers.
+    let of_task = config.partition.evaluation_views.max(1) as usize;
+    let parts = held_out.len().div_ceil(of_task).min(plan.partitions.len());
+    for part in 0..parts {
+        let views = &held_out[views_of_part(part, parts, held_out.len())];
+        let common = common_spec(plan, views, config.data.max_resolution);
+        let (task, all) = match parts {
+            1 => (Stage::Evaluate.task(), Vec::new()),
+            _ => (Stage::Evaluate.task_of(part as u32 + 1), held_out.clone()),
+        };
+        let work = Work::Evaluate(EvaluateSpec { seams: seams.clone(), held_out: all });
+        tasks.insert(task, put_spec(objects, config.method, common, work, 0).await?);
     }
     Ok(tasks)
 }

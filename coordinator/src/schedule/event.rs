@@ -65,6 +65,12 @@ impl Planned {
     pub fn partitions(&self) -> u32 {
         self.tasks.keys().filter(|task| task.stage == Stage::Partition).count() as u32
     }
+
+    /// Number of tasks that evaluate a part of the held-out views each.
+    pub fn evaluations(&self) -> u32 {
+        let is_part = |task: &&TaskId| task.stage == Stage::Evaluate && task.part.is_some();
+        self.tasks.keys().filter(is_part).count() as u32
+    }
 }
 
 impl PlannedTask {

@@ -5,7 +5,7 @@ use std::str::FromStr;
 
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
-use super::Stage;
+use super::{Stage, Tasks};
 
 /// Name of a job: 20 hex digits, the first 12 the milliseconds of its creation, so that names sort by time.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
@@ -56,31 +56,59 @@ impl FromStr for JobId {
     }
 }
 
-/// Name of a task within its job; orders as the job goes. Written as the name of its stage ("merge"), with
-/// the index of the partition where the stage has one task for each ("partition-0003").
+/// Name of a task within its job; orders as the job goes. Written as the name of its stage ("merge"). The
+/// index of the partition follows where the stage has one task for each ("partition-0003"), and the number of
+/// the part where several tasks evaluate ("evaluate-0001").
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct TaskId {
     /// The stage that it belongs to.
     pub stage: Stage,
-    /// Index of the partition, from 0, exactly where the stage has one task for each partition.
-    pub partition: Option<u32>,
+    /// Index of the partition, from 0, exactly where the stage has one task for each partition. Number of the
+    /// part of the held-out views, from 1, where several tasks evaluate.
+    pub part: Option<u32>,
 }
 
 impl Stage {
     /// The only task of this stage.
     pub const fn task(self) -> TaskId {
-        TaskId { stage: self, partition: None }
+        TaskId { stage: self, part: None }
     }
 
-    /// The task of this stage for a partition.
-    pub const fn task_of(self, partition: u32) -> TaskId {
-        TaskId { stage: self, partition: Some(partition) }
+    /// The task of this stage for a partition, or for a part of the held-out views.
+    pub const fn task_of(self, part: u32) -> TaskId {
+        TaskId { stage: self, part: Some(part) }
+    }
+
+    /// Whether it may have a task with this part.
+    fn has(self, part: Option<u32>) -> bool {
+        match self.spec().tasks {
+            Tasks::One => part.is_none(),
+            Tasks::Partitions => part.is_some(),
+            Tasks::Views => part != Some(0),
+        }
+    }
+
+    /// The task with a number, of which a store makes its keys; `None` if there is none. See
+    /// [`TaskId::number`].
+    pub fn numbered(self, number: u32) -> Option<TaskId> {
+        let without = self.task();
+        match number {
+            0 if self.has(None) => Some(without),
+            _ => Some(self.task_of(number)).filter(|id| self.has(id.part)),
+        }
+    }
+}
+
+impl TaskId {
+    /// Its number among the tasks of its stage, for keys of a store: its part, or 0.
+    pub fn number(self) -> u32 {
+        self.part.unwrap_or(0)
     }
 }
 
 impl fmt::Display for TaskId {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self.partition {
+        match self.part {
             None => f.write_str(self.stage.name()),
             Some(index) => write!(f, "{}-{index:04}", self.stage.name()),
         }
@@ -92,15 +120,14 @@ impl FromStr for TaskId {
 
     fn from_str(text: &str) -> Result<Self, ParseIdError> {
         let fault = || ParseIdError { what: "task", text: text.to_owned() };
-        let (name, partition) = match text.split_once('-') {
+        let (name, part) = match text.split_once('-') {
             None => (text, None),
             Some((name, index)) => (name, Some(index.parse().map_err(|_| fault())?)),
         };
         let stage = Stage::all().find(|stage| stage.name() == name).ok_or_else(fault)?;
-        let id = Self { stage, partition };
+        let id = Self { stage, part };
         // Only the canonical form of Display: "partition-3" and "partition-0003" would be two keys.
-        let is_whole = stage.spec().per_partition == partition.is_some() && id.to_string() == text;
-        if is_whole { Ok(id) } else { Err(fault()) }
+        if stage.has(part) && id.to_string() == text { Ok(id) } else { Err(fault()) }
     }
 }
 
@@ -123,10 +150,10 @@ mod tests {
     #[test]
     fn every_name_reads_back_as_itself_and_no_other_name_reads() {
         for stage in Stage::all() {
-            let ids = if stage.spec().per_partition {
-                vec![stage.task_of(0), stage.task_of(3), stage.task_of(54321)]
-            } else {
-                vec![stage.task()]
+            let ids = match stage.spec().tasks {
+                Tasks::One => vec![stage.task()],
+                Tasks::Partitions => vec![stage.task_of(0), stage.task_of(3), stage.task_of(54321)],
+                Tasks::Views => vec![stage.task(), stage.task_of(1), stage.task_of(54321)],
             };
             for id in ids {
                 assert_eq!(id.to_string().parse(), Ok(id));

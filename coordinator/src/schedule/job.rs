@@ -21,6 +21,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use fathom_core::scene::BlobRef;
 use serde::{Deserialize, Serialize};
 
+use super::stages::Tasks;
 use super::{Artifact, JobId, Stage, TaskId, Tenant};
 use crate::datasets::DatasetId;
 
@@ -66,22 +67,32 @@ impl JobState {
 pub struct JobShape {
     /// Number of partitions.
     pub partitions: u32,
+    /// Number of tasks that evaluate a part of the held-out views each; 0 where one evaluates all.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub evaluations: u32,
     /// Stages that it has, in order.
     pub stages: BTreeSet<Stage>,
+}
+
+fn is_zero(count: &u32) -> bool {
+    *count == 0
 }
 
 impl JobShape {
     /// The shape of a job before it is planned.
     pub fn unplanned() -> Self {
-        Self { partitions: 0, stages: BTreeSet::from([Stage::Plan]) }
+        Self { stages: BTreeSet::from([Stage::Plan]), ..Self::default() }
     }
 
     /// The tasks of one stage.
     pub fn tasks_of(&self, stage: Stage) -> Vec<TaskId> {
-        match (self.stages.contains(&stage), stage.spec().per_partition) {
-            (false, _) => Vec::new(),
-            (true, false) => vec![stage.task()],
-            (true, true) => (0..self.partitions).map(|partition| stage.task_of(partition)).collect(),
+        match stage.spec().tasks {
+            _ if !self.stages.contains(&stage) => Vec::new(),
+            Tasks::Partitions => (0..self.partitions).map(|partition| stage.task_of(partition)).collect(),
+            Tasks::Views if self.evaluations > 0 => {
+                (1..=self.evaluations).map(|part| stage.task_of(part)).collect()
+            }
+            Tasks::One | Tasks::Views => vec![stage.task()],
         }
     }
 

@@ -31,7 +31,7 @@ pub use leases::{LeaseTable, LiveProgress, Renewed};
 pub use queue::{Next, OpenWork, Queue, ReadyTask, Usage};
 pub use rows::{JobRows, Rules};
 pub use scheduler::{RowsNeeded, rows_needed, step};
-pub use stages::{Artifact, RunsOn, STAGES, Stage, StageSpec};
+pub use stages::{Artifact, RunsOn, STAGES, Stage, StageSpec, Tasks};
 pub use straggler::usual_pace_ms;
 pub use task::{Attempt, CheckpointRecord, HeldOut, Lease, TaskRecord, TaskState, TaskStats};
 pub use tenant::{Quota, Tenant};

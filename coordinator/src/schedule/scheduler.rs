@@ -50,9 +50,9 @@ pub fn rows_needed(job: &JobRecord, event: &Event) -> RowsNeeded {
 
 /// The tasks of the same partition that start from the result of `task`.
 fn successors(shape: &JobShape, task: TaskId) -> Vec<TaskId> {
-    let Some(partition) = task.partition else { return Vec::new() };
+    let Some(partition) = task.part.filter(|_| task.stage.is_per_partition()) else { return Vec::new() };
     let starts_from_it = |stage: &Stage| {
-        shape.stages.contains(stage) && stage.spec().per_partition && stage.takes(task.stage.result())
+        shape.stages.contains(stage) && stage.is_per_partition() && stage.takes(task.stage.result())
     };
     Stage::all().filter(starts_from_it).map(|stage| stage.task_of(partition)).collect()
 }
@@ -284,7 +284,7 @@ fn complete(
     job.open_tasks = job.open_tasks.saturating_sub(1);
     job.leased_tasks = job.leased_tasks.saturating_sub(leases);
     job.iterations_done += iterations;
-    if task.partition.is_none() {
+    if task.part.is_none() {
         job.outputs.extend(made);
     }
     for successor in successors(&rows.job.shape, task) {
@@ -319,6 +319,7 @@ fn result_of(task: TaskId, output: &TaskOutput) -> Option<BlobRef> {
 fn accept_plan(rows: &mut JobRows, planned: Planned, events: &mut Vec<EventBody>) {
     let job = &mut rows.job;
     job.shape.partitions = planned.partitions();
+    job.shape.evaluations = planned.evaluations();
     job.shape.stages.extend(planned.tasks.keys().map(|task| task.stage));
     job.iterations_total = planned.tasks.values().map(|task| u64::from(task.iterations)).sum();
     for (task, PlannedTask { spec, iterations, method, memory_bytes }) in planned.tasks {

@@ -409,7 +409,7 @@ impl Simulation {
             ));
         }
         for (task, record) in &self.rows.tasks {
-            match (task.stage, task.partition) {
+            match (task.stage, task.part) {
                 (Stage::Partition, Some(index)) => {
                     if record.attempts > 0 && exchange.is_none() {
                         faults.push(format!("{task} began before the exchange"));
@@ -449,7 +449,8 @@ impl Simulation {
         if has_borders != self.rows.tasks.contains_key(&Stage::Borders.task()) {
             faults.push(format!("a shape with borders: {has_borders}, and other tasks"));
         }
-        if attempts(Stage::Evaluate.task()) > 0 && has_borders && bordered.is_none() {
+        let evaluations = self.rows.job.shape.tasks_of(Stage::Evaluate);
+        if evaluations.into_iter().any(|task| attempts(task) > 0) && has_borders && bordered.is_none() {
             faults.push("a model is measured whose borders are being trained".into());
         }
         faults
@@ -479,7 +480,11 @@ fn output(task: TaskId, result: BlobRef, seed: u32) -> TaskOutput {
             let planned = |name: &str| PlannedTask::new(blob(name.to_owned()), 10);
             let mut tasks = BTreeMap::from([own(Stage::Merge), own(Stage::Artifacts)]);
             tasks.insert(Stage::Global.task(), planned("global"));
-            tasks.insert(Stage::Evaluate.task(), PlannedTask::new(blob("evaluate".into()), 0));
+            let evaluate = |task| (task, PlannedTask::new(blob(format!("{task}")), 0));
+            match seed % 3 {
+                0 => tasks.extend((1..=3).map(|part| evaluate(Stage::Evaluate.task_of(part)))),
+                _ => tasks.extend([evaluate(Stage::Evaluate.task())]),
+            }
             tasks.extend(has_first_parts.then(|| own(Stage::Exchange)));
             tasks.extend(borders.then(|| (Stage::Borders.task(), planned("borders"))));
             for k in 0..6 {

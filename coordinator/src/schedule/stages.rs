@@ -1,4 +1,4 @@
-//! The table of stages: where each runs, once or for each partition, with input and output artifacts.
+//! The table of stages: where each runs, in how many tasks, with input and output artifacts.
 //!
 //! All generic code about stages uses this table: the rules, the queue, the time forecast, metrics, messages,
 //! and retention. `docs/internals/extending.md` lists the files that a new stage touches.
@@ -74,6 +74,17 @@ pub enum RunsOn {
     Worker,
 }
 
+/// How many tasks a stage has.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Tasks {
+    /// One.
+    One,
+    /// One for each partition.
+    Partitions,
+    /// One, or several that take a part of the held-out views each.
+    Views,
+}
+
 /// A row of the table.
 #[derive(Clone, Copy, Debug)]
 pub struct StageSpec {
@@ -83,8 +94,8 @@ pub struct StageSpec {
     pub name: &'static str,
     /// Where its tasks run.
     pub runs_on: RunsOn,
-    /// Whether it has one task for each partition; otherwise it has one task.
-    pub per_partition: bool,
+    /// How many tasks it has.
+    pub tasks: Tasks,
     /// Whether its tasks are training, which takes nearly all of the time of a job.
     pub trains: bool,
     /// Artifacts that its tasks start from, where the job has them. Of an artifact that is made for each
@@ -101,7 +112,7 @@ pub const STAGES: [StageSpec; 9] = [
         stage: Stage::Plan,
         name: "plan",
         runs_on: RunsOn::Coordinator,
-        per_partition: false,
+        tasks: Tasks::One,
         trains: false,
         inputs: &[],
         outputs: &[Artifact::Plan, Artifact::PlanPicture],
@@ -110,7 +121,7 @@ pub const STAGES: [StageSpec; 9] = [
         stage: Stage::Global,
         name: "global",
         runs_on: RunsOn::Worker,
-        per_partition: false,
+        tasks: Tasks::One,
         trains: true,
         inputs: &[],
         outputs: &[Artifact::CoarseModel],
@@ -119,7 +130,7 @@ pub const STAGES: [StageSpec; 9] = [
         stage: Stage::FirstPart,
         name: "first_part",
         runs_on: RunsOn::Worker,
-        per_partition: true,
+        tasks: Tasks::Partitions,
         trains: true,
         inputs: &[Artifact::CoarseModel],
         outputs: &[Artifact::FirstPart],
@@ -128,7 +139,7 @@ pub const STAGES: [StageSpec; 9] = [
         stage: Stage::Exchange,
         name: "exchange",
         runs_on: RunsOn::Coordinator,
-        per_partition: false,
+        tasks: Tasks::One,
         trains: false,
         inputs: &[Artifact::CoarseModel, Artifact::FirstPart],
         outputs: &[Artifact::Exchange],
@@ -137,7 +148,7 @@ pub const STAGES: [StageSpec; 9] = [
         stage: Stage::Partition,
         name: "partition",
         runs_on: RunsOn::Worker,
-        per_partition: true,
+        tasks: Tasks::Partitions,
         trains: true,
         inputs: &[Artifact::CoarseModel, Artifact::FirstPart, Artifact::Exchange],
         outputs: &[Artifact::PartitionModel],
@@ -146,7 +157,7 @@ pub const STAGES: [StageSpec; 9] = [
         stage: Stage::Merge,
         name: "merge",
         runs_on: RunsOn::Coordinator,
-        per_partition: false,
+        tasks: Tasks::One,
         trains: false,
         inputs: &[Artifact::Plan, Artifact::PartitionModel],
         outputs: &[Artifact::Model, Artifact::MergeReport],
@@ -155,7 +166,7 @@ pub const STAGES: [StageSpec; 9] = [
         stage: Stage::Borders,
         name: "borders",
         runs_on: RunsOn::Worker,
-        per_partition: false,
+        tasks: Tasks::One,
         trains: true,
         inputs: &[Artifact::Model],
         outputs: &[Artifact::Model],
@@ -164,7 +175,7 @@ pub const STAGES: [StageSpec; 9] = [
         stage: Stage::Evaluate,
         name: "evaluate",
         runs_on: RunsOn::Worker,
-        per_partition: false,
+        tasks: Tasks::Views,
         trains: false,
         inputs: &[Artifact::Model],
         outputs: &[Artifact::Evaluation],
@@ -173,7 +184,7 @@ pub const STAGES: [StageSpec; 9] = [
         stage: Stage::Artifacts,
         name: "artifacts",
         runs_on: RunsOn::Coordinator,
-        per_partition: false,
+        tasks: Tasks::One,
         trains: false,
         inputs: &[
             Artifact::Plan,
@@ -209,6 +220,11 @@ impl Stage {
     /// Its name.
     pub fn name(self) -> &'static str {
         self.spec().name
+    }
+
+    /// Whether it has one task for each partition.
+    pub fn is_per_partition(self) -> bool {
+        self.spec().tasks == Tasks::Partitions
     }
 
     /// Whether the coordinator does its tasks itself.

@@ -13,7 +13,7 @@ const MAX_SECOND_ATTEMPTS: u32 = 1;
 
 /// Whether the job has siblings to compare the task with.
 fn has_siblings(task: TaskId) -> bool {
-    task.stage.spec().per_partition
+    task.stage.is_per_partition()
 }
 
 impl TaskRecord {

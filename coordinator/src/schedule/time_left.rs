@@ -74,7 +74,7 @@ mod tests {
         let (mut job, _) = NewJob::sample(0).into_rows(0);
         let stages =
             [Stage::Plan, Stage::Global, Stage::Partition, Stage::Merge, Stage::Evaluate, Stage::Artifacts];
-        job.shape = JobShape { partitions, stages: stages.into() };
+        job.shape = JobShape { partitions, stages: stages.into(), ..JobShape::default() };
         job
     }
 

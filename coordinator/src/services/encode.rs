@@ -231,7 +231,7 @@ fn task(record: &TaskRecord, live: Option<&LiveProgress>) -> v1::Task {
     v1::Task {
         task_id: record.task.to_string(),
         stage: v1::Stage::from(record.task.stage).into(),
-        partition: record.task.partition.unwrap_or(0),
+        partition: record.task.number(),
         state: state.into(),
         attempts: record.attempts,
         errors: record.errors,

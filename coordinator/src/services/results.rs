@@ -8,7 +8,7 @@ use prost::Message;
 
 use super::{encode, turn_to_read};
 use crate::objects::BlobStore;
-use crate::own_tasks::artifacts::MAX_EVALUATION_BYTES;
+use crate::own_tasks::evaluation::MAX_EVALUATION_BYTES;
 use crate::own_tasks::exchange::MAX_FIRST_PART_BYTES;
 use crate::schedule::Stage;
 use crate::service_error::ServiceError;

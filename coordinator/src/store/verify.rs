@@ -65,11 +65,11 @@ pub fn faults(export: &Export) -> Vec<String> {
 fn faults_of_job(JobExport { job, tasks, events }: &JobExport) -> Vec<String> {
     let mut faults = Vec::new();
     let known: BTreeSet<TaskId> = tasks.iter().map(|record| record.task).collect();
-    // A number of partitions is only trusted if there are as many tasks: four thousand million do not fit
-    // into memory.
-    let partitions = job.shape.partitions;
-    if partitions as usize > tasks.len() {
-        return vec![format!("it should have {partitions} partitions, and has {} tasks", tasks.len())];
+    // A number of tasks is only trusted if there are as many: four thousand million do not fit into memory.
+    for (count, what) in [(job.shape.partitions, "partitions"), (job.shape.evaluations, "evaluations")] {
+        if count as usize > tasks.len() {
+            return vec![format!("it should have {count} {what}, and has {} tasks", tasks.len())];
+        }
     }
     let wanted: BTreeSet<TaskId> = job.shape.tasks().into_iter().collect();
     for task in wanted.difference(&known) {
@@ -153,8 +153,11 @@ mod tests {
         type Break = fn(&mut Export);
         let broken: [(&str, Break); 16] = [
             ("4294967295 partitions, and has 1 tasks", |export| {
-                export.jobs[0].job.shape =
-                    JobShape { partitions: u32::MAX, stages: [Stage::Partition].into() }
+                export.jobs[0].job.shape = JobShape {
+                    partitions: u32::MAX,
+                    stages: [Stage::Partition].into(),
+                    ..JobShape::default()
+                }
             }),
             ("came from one request", |export| export.jobs[1].job.request_id = "request 0".into()),
             ("was granted twice", |export| export.jobs[1].tasks[0].fence = 1),

@@ -116,7 +116,7 @@ impl Acknowledged {
             );
         }
         for ((job, id), digest) in &self.completed {
-            if let (Stage::FirstPart, Some(index)) = (id.stage, id.partition) {
+            if let (Stage::FirstPart, Some(index)) = (id.stage, id.part) {
                 let successor = task(job, &Stage::Partition.task_of(index));
                 let input = successor.inputs.get(&Artifact::FirstPart).map(|blob| &blob.digest);
                 assert_eq!(
@@ -233,7 +233,12 @@ pub fn output(task: TaskId, fence: u64) -> TaskOutput {
             let own = |stage: Stage| (stage.task(), PlannedTask::default());
             let planned = |name: &str| PlannedTask::new(blob(name), 10);
             let mut tasks = BTreeMap::from([own(Stage::Merge), own(Stage::Artifacts)]);
-            tasks.insert(Stage::Evaluate.task(), PlannedTask::new(blob("evaluate"), 0));
+            // Every fifth job is evaluated by two tasks.
+            let evaluate = |task: TaskId| (task, PlannedTask::new(blob(&task.to_string()), 0));
+            match fence.is_multiple_of(5) {
+                true => tasks.extend([1, 2].map(|part| evaluate(Stage::Evaluate.task_of(part)))),
+                false => tasks.extend([evaluate(Stage::Evaluate.task())]),
+            }
             // Every other job has two tasks a partition, and an exchange between.
             let has_first_parts = fence.is_multiple_of(2);
             tasks.extend(has_first_parts.then(|| own(Stage::Exchange)));

@@ -195,14 +195,22 @@ pub struct PartitionConfig {
     /// in 2x2, 1000 iterations lose 0.52 dB; a coarse model of 1000 iterations instead of 250 regains 0.41 dB
     /// (bench/history.jsonl).
     pub global_least_iterations: u32,
+    /// Maximum iterations of the global stage, unless `global_least_iterations` is more. Default 30000
+    /// (ours). One worker trains it while all others wait, so it must not grow with the scene.
+    pub global_most_iterations: u32,
     /// Cap of the global stage as a share of the job's. Default 0.25 (ours).
     pub global_gaussians: f64,
+    /// Maximum Gaussians of the global stage. Default 4000000 (ours). They take about 4 GB of GPU memory.
+    pub global_most_gaussians: u32,
     /// Share of a partition's iterations after which it continues beside the Gaussians that its neighbours
     /// have trained so far. Default 1 (bench/history.jsonl: 0.5 to 0.85 changed less than seeds do). Until
     /// then, it trains beside the coarse model around its cell. Must be above 0; 1 disables the exchange.
     pub neighbours_from: f64,
     /// Iterations of every partition. Default 0. 0 gives each partition a share by its cameras.
     pub iterations_per_partition: u32,
+    /// Held-out views that one task evaluates, if there are several partitions. Default 64. Each task fetches
+    /// the merged model, and there are at most as many tasks as partitions.
+    pub evaluation_views: u32,
     /// Target of the depth-aware weight of a partition: `none`, `loss_factor` or `joint`. Default none
     /// (docs/decisions/0014).
     pub weights: WeightMode,
@@ -226,9 +234,12 @@ impl Default for PartitionConfig {
             visibility_edge_factor: 0.3,
             global_iterations: 0.25,
             global_least_iterations: 1000,
+            global_most_iterations: 30_000,
             global_gaussians: 0.25,
+            global_most_gaussians: 4_000_000,
             neighbours_from: 1.0,
             iterations_per_partition: 0,
+            evaluation_views: 64,
             weights: WeightMode::None,
             weight_terms: WeightTerms::default(),
         }
@@ -278,6 +289,11 @@ impl JobConfig {
             p.global_gaussians > 0.0 && p.global_gaussians <= 1.0,
             "partition.global_gaussians must be above 0 and at most 1",
         );
+        require(
+            p.global_most_iterations >= 1 && p.global_most_gaussians >= 16,
+            "partition.global_most_iterations must be at least 1, and global_most_gaussians at least 16",
+        );
+        require(p.evaluation_views >= 1, "partition.evaluation_views must be at least 1");
         require(
             p.neighbours_from > 0.0 && p.neighbours_from <= 1.0,
             "partition.neighbours_from must be a share of a partition's run, above 0 and at most 1 (1 disables it)",

@@ -8,7 +8,7 @@ use crate::config::SeamsConfig;
 use crate::gaussians::Gaussians;
 use crate::metrics::SsimMap;
 use crate::scene::{PinholeCamera, Pose};
-use crate::seams::{SeamLines, SeamMeter, SeamReport, SeenView};
+use crate::seams::{SeamLines, SeamMeter, SeamReport, SeamSums, SeenView};
 use crate::views::PackedImage;
 use crate::{CoreError, Result};
 
@@ -77,6 +77,11 @@ impl SeamRun {
     }
 
     /// All measurements; views are in the order in which they were added.
+    pub fn sums(self) -> SeamSums {
+        self.meter.sums()
+    }
+
+    /// The results of [`SeamRun::sums`].
     pub fn report(self) -> SeamReport {
         self.meter.report()
     }

@@ -36,8 +36,8 @@ use crate::metrics::SsimMap;
 use crate::scene::{PinholeCamera, Pose};
 use crate::views::PackedImage;
 
-use report::Sums;
-pub use report::{BandReport, InteriorReport, RangeSteps, SeamReport, Steps, ViewSeams, put_into};
+pub use report::{BandReport, InteriorReport, RangeSteps, SeamReport, SeamSums, Steps, ViewSeams, put_into};
+use report::{StepList, Sums};
 use steps::{StepsOf, steps};
 pub use surfaces::SURFACE_ALPHA;
 use surfaces::{BESIDE, Surfaces, Zones};
@@ -155,10 +155,7 @@ pub struct SeenView<'a> {
 pub struct SeamMeter {
     lines: SeamLines,
     config: SeamsConfig,
-    views: Vec<Sums>,
-    /// Across the lines, and beside them.
-    border_steps: [Vec<f32>; 2],
-    control_steps: [Vec<f32>; 2],
+    sums: SeamSums,
 }
 
 /// The zones of a view, to draw a picture of them.
@@ -182,8 +179,8 @@ impl ViewZones {
 impl SeamMeter {
     /// A meter without measurements.
     pub fn new(lines: SeamLines, config: SeamsConfig) -> Self {
-        let (border_steps, control_steps) = Default::default();
-        Self { lines, config, views: Vec::new(), border_steps, control_steps }
+        let sums = SeamSums { band: lines.band, ..SeamSums::default() };
+        Self { lines, config, sums }
     }
 
     /// Measures `render` against `truth`, whose mask counts. All pictures have the size of the camera; `ssim`
@@ -200,24 +197,29 @@ impl SeamMeter {
         let least = self.config.least_share * zones.len() as f64;
         let sums = Sums::of(&zones, render, truth, ssim, least);
         let counts = sums.border_counts();
-        self.views.push(sums);
+        self.sums.views.push(sums);
         let beside = BESIDE * self.lines.band;
-        let find = |lines: &[Line], [band, flank]: [Zones; 2], found: &mut [Vec<f32>; 2]| {
+        let find = |lines: &[Line], [band, flank]: [Zones; 2], found: &mut [StepList; 2]| {
             let StepsOf { on, steps: across } = steps(&surfaces, &zones, lines, &[0.0], band);
             found[0].extend(across);
             found[1].extend(steps(&surfaces, &zones, lines, &[-beside, beside], flank).steps);
             on
         };
         let on_border =
-            find(&self.lines.borders, [Zones::BORDER, Zones::BORDER_FLANK], &mut self.border_steps);
+            find(&self.lines.borders, [Zones::BORDER, Zones::BORDER_FLANK], &mut self.sums.border_steps);
         let on_control =
-            find(&self.lines.controls, [Zones::CONTROL, Zones::CONTROL_FLANK], &mut self.control_steps);
+            find(&self.lines.controls, [Zones::CONTROL, Zones::CONTROL_FLANK], &mut self.sums.control_steps);
         ViewZones { width: surfaces.width, zones, on_border, on_control, counts }
+    }
+
+    /// All that was measured.
+    pub fn sums(self) -> SeamSums {
+        self.sums
     }
 
     /// The results.
     pub fn report(self) -> SeamReport {
-        SeamReport::of(self.lines.band, &self.views, self.border_steps, self.control_steps)
+        self.sums.report()
     }
 }
 

@@ -118,8 +118,8 @@ pub struct ViewSeams {
     pub control_ssim: Option<f64>,
 }
 
-/// Sums over the pixels of one zone.
-#[derive(Clone, Copy, Debug, Default)]
+/// Sums over the pixels of one zone. They may come from a worker, so no value is trusted.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 struct Sum {
     pixels: u64,
     /// Squared differences of 8-bit values, all channels.
@@ -130,14 +130,14 @@ struct Sum {
 impl Sum {
     fn plus(self, other: Self) -> Self {
         Self {
-            pixels: self.pixels + other.pixels,
-            squares: self.squares + other.squares,
+            pixels: self.pixels.saturating_add(other.pixels),
+            squares: self.squares.saturating_add(other.squares),
             ssim: self.ssim + other.ssim,
         }
     }
 
     fn psnr(&self) -> Option<f64> {
-        let mse = self.squares as f64 / (3 * self.pixels) as f64 / (255.0 * 255.0);
+        let mse = self.squares as f64 / (3.0 * self.pixels as f64) / (255.0 * 255.0);
         finite(-10.0 * mse.log10())
     }
 
@@ -147,7 +147,7 @@ impl Sum {
 }
 
 /// The zones of one view.
-#[derive(Clone, Copy, Debug, Default)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Sums {
     border: Sum,
     border_flank: Sum,
@@ -225,13 +225,72 @@ impl Sums {
     }
 }
 
+/// All that was measured at the borders of cells, from which a [`SeamReport`] follows. Several workers
+/// measure a part of the views each; appended in the order of the views, their sums give the report of all
+/// views.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct SeamSums {
+    /// Width of a band on either side of a line, scene units.
+    pub(super) band: f64,
+    /// Each view, in the order of measuring.
+    pub(super) views: Vec<Sums>,
+    /// Steps across the lines, and beside them.
+    pub(super) border_steps: [StepList; 2],
+    pub(super) control_steps: [StepList; 2],
+}
+
+/// Steps of one kind.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct StepList {
+    /// How many were measured.
+    pairs: u64,
+    /// All of them, or as many as are kept.
+    steps: Vec<f32>,
+}
+
+impl StepList {
+    pub fn extend(&mut self, steps: Vec<f32>) {
+        self.pairs = self.pairs.saturating_add(steps.len() as u64);
+        self.steps.extend(steps);
+    }
+}
+
+impl SeamSums {
+    /// Number of measured views.
+    pub fn views(&self) -> usize {
+        self.views.len()
+    }
+
+    /// Adds what was measured on later views.
+    pub fn append(&mut self, later: Self) {
+        self.band = later.band;
+        self.views.extend(later.views);
+        let lists = self.border_steps.iter_mut().chain(&mut self.control_steps);
+        for (mine, theirs) in lists.zip(later.border_steps.into_iter().chain(later.control_steps)) {
+            mine.pairs = mine.pairs.saturating_add(theirs.pairs);
+            mine.steps.extend(theirs.steps);
+        }
+    }
+
+    /// Keeps at most `most` steps of each kind, evenly spaced in the order of measuring: their medians change
+    /// little, and all parts of a large scene fit the coordinator's memory.
+    pub fn thin(&mut self, most: usize) {
+        for StepList { steps, .. } in self.border_steps.iter_mut().chain(&mut self.control_steps) {
+            let all = steps.len();
+            if all > most {
+                *steps = (0..most).map(|kept| steps[kept * all / most]).collect();
+            }
+        }
+    }
+
+    /// The results.
+    pub fn report(self) -> SeamReport {
+        SeamReport::of(self.band, &self.views, self.border_steps, self.control_steps)
+    }
+}
+
 impl SeamReport {
-    pub(super) fn of(
-        band: f64,
-        views: &[Sums],
-        border_steps: [Vec<f32>; 2],
-        control_steps: [Vec<f32>; 2],
-    ) -> Self {
+    fn of(band: f64, views: &[Sums], border_steps: [StepList; 2], control_steps: [StepList; 2]) -> Self {
         let border = BandReport::of(views, |view| [&view.border, &view.border_flank]);
         let control = BandReport::of(views, |view| [&view.control, &view.control_flank]);
         let interior = views.iter().fold(Sum::default(), |sum, view| sum.plus(view.interior));
@@ -281,9 +340,9 @@ impl BandReport {
 }
 
 impl Steps {
-    fn of([across, beside]: [Vec<f32>; 2]) -> Self {
-        let (pairs, beside_pairs) = (across.len() as u64, beside.len() as u64);
-        let (median, beside_median) = (median(across), median(beside));
+    fn of([across, beside]: [StepList; 2]) -> Self {
+        let (pairs, beside_pairs) = (across.pairs, beside.pairs);
+        let (median, beside_median) = (median(across.steps), median(beside.steps));
         let ratio = median.zip(beside_median).and_then(|(across, beside)| finite(across / beside));
         Self { pairs, median, beside_pairs, beside_median, ratio }
     }

@@ -21,9 +21,9 @@ use fathom_coordinator::store::{
     OpenWork, ReadyTask, Store, StoreError, StoredEvent, WorkerMark,
 };
 use fathom_core::scene::BlobRef;
+use fathom_invariants::Fact;
 use tonic::async_trait;
 
-use crate::history::Fact;
 use crate::random::Random;
 use crate::world::{Safeguard, World};
 

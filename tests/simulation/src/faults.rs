@@ -4,9 +4,9 @@ use std::cmp::Reverse;
 use std::sync::Arc;
 use std::time::Duration;
 
+use fathom_invariants::Fact;
 use turmoil::Sim;
 
-use crate::history::Fact;
 use crate::network::COORDINATOR;
 use crate::random::Random;
 use crate::world::World;

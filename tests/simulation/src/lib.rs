@@ -21,6 +21,7 @@ pub mod results;
 pub mod scene;
 pub mod trainer;
 pub mod users;
+pub mod week;
 pub mod world;
 
 pub use world::{Counts, Options, Run, Safeguard, run};

@@ -4,6 +4,7 @@
 use std::fmt;
 use std::sync::Arc;
 
+use fathom_invariants::Fact;
 use tracing::field::{Field, Visit};
 use tracing::span::{Attributes, Id};
 use tracing::{Event, Subscriber};
@@ -11,7 +12,6 @@ use tracing_subscriber::Layer;
 use tracing_subscriber::layer::Context;
 use tracing_subscriber::registry::LookupSpan;
 
-use crate::history::Fact;
 use crate::world::World;
 
 /// Receives every log line of the simulating thread.

@@ -77,6 +77,8 @@ pub fn config(partitions: u32, variety: Variety) -> JobConfig {
     config.partition.columns = partitions;
     config.data.test_every = 6;
     config.train.iterations = 120;
+    // Where a job has several partitions, several tasks evaluate.
+    config.partition.evaluation_views = 1;
     match variety {
         Variety::Plain => {}
         Variety::Water => config.water.partitions = WaterPartitions::Joint,

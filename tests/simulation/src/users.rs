@@ -7,6 +7,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use fathom_coordinator::schedule::JobId;
+use fathom_invariants::Fact;
 use fathom_proto::admin::v1 as admin_v1;
 use fathom_proto::admin::v1::admin_service_client::AdminServiceClient;
 use fathom_proto::dial::{Connection, reason};
@@ -20,7 +21,6 @@ use futures::future::{join_all, try_join_all};
 use prost::Message;
 use tonic::{Code, Status};
 
-use crate::history::Fact;
 use crate::network::dial;
 use crate::random::Random;
 use crate::scene::{Scene, blob_ref, config, scene};

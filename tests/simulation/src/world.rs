@@ -10,6 +10,7 @@ use fathom_coordinator::access::{Role, TokenRecord};
 use fathom_coordinator::retention::{Housekeeping, Policy};
 use fathom_coordinator::schedule::JobId;
 use fathom_coordinator::{Clock, CoordinatorConfig, serve_over};
+use fathom_invariants::Fact;
 use fathom_observe::threads;
 use fathom_worker::{WorkerConfig, run_with};
 use serde::{Deserialize, Serialize};
@@ -18,7 +19,7 @@ use tracing_subscriber::layer::SubscriberExt;
 
 use crate::disk::{Disk, DiskStore};
 use crate::faults::Faults;
-use crate::history::{Fact, History};
+use crate::history::History;
 use crate::invariants;
 use crate::lines::Lines;
 use crate::network::{COORDINATOR, dial, listen};

@@ -1,7 +1,8 @@
 //! EVALUATE: renders the held-out views of the merged model and measures them.
 //!
 //! Protocol: the render is clamped and rounded to 8 bits in sRGB, over black or through the model's water, as
-//! in training.
+//! in training. Where several tasks measure a part of the views each, all of them together give the results
+//! of one.
 
 use std::sync::Arc;
 
@@ -19,6 +20,7 @@ use fathom_proto::v1::Progress;
 use fathom_proto::worker::v1::{self, Artifact, EvaluateSpec, Evaluation, FailClass, ViewMetrics};
 use glam::DQuat;
 use prost::Message;
+use serde::Serialize;
 
 use super::training::read_points;
 use super::{Control, TaskError, TaskInput, TaskOutput, input_fault};
@@ -30,6 +32,8 @@ const FORMAT: u32 = 1;
 const BACKGROUND: [f32; 3] = [0.0; 3];
 /// Views that set the brightness of pictures of J, at half their size.
 const EXPOSED_VIEWS: usize = 64;
+/// Most steps across lines of each kind that a part of the evaluation keeps.
+const MOST_STEPS: usize = 1 << 12;
 /// Differences are amplified by this factor; a tenth of the 8-bit range is hard to see.
 const DIFFERENCE_GAIN: u8 = 4;
 
@@ -57,12 +61,18 @@ pub fn run(
         }
         None => None,
     };
+    let (points, cameras) = (read_points(task)?, all_cameras(task)?);
+    let is_part = !spec.held_out.is_empty();
+    // Brightness and cover are those of the whole job, also where other workers measure the other views.
+    let held_out = if is_part { &spec.held_out } else { &task.common.views };
     let gains = match &record {
-        Some(record) => Some(gains_of(&mut renderer, WaterView::of_record(record, Output::Restored), views)?),
+        Some(record) => {
+            let clear = WaterView::of_record(record, Output::Restored);
+            Some(gains_of(&mut renderer, clear, &cameras, held_out)?)
+        }
         None => None,
     };
-    let (points, cameras) = (read_points(task)?, all_cameras(task)?);
-    let mut cover = CoverMeter::new(&cameras, &task.common.views, &points);
+    let mut cover = CoverMeter::new(&cameras, held_out, &points);
     let count = views.views().len() as u32;
     let mut measured = Vec::with_capacity(views.views().len());
     for (index, view) in views.views().iter().enumerate() {
@@ -115,45 +125,55 @@ pub fn run(
             ..Progress::default()
         });
     }
-    let adapter = gpu.adapter().name.clone();
-    let unwritable = |what: &str, error: serde_json::Error| TaskError::Failed {
-        class: FailClass::Training,
-        message: format!("the measurements {what} cannot be written: {error}"),
-    };
-    let seams_json = match seams {
-        Some(seams) => {
-            serde_json::to_string(&seams.report()).map_err(|error| unwritable("at borders", error))?
-        }
-        None => String::new(),
-    };
-    let cover_json = serde_json::to_string(&cover.report()).map_err(|error| unwritable("of cover", error))?;
-    let clear_gains = gains.map_or_else(Vec::new, |gains| gains.to_vec());
-    let evaluation = Evaluation {
+    let mut evaluation = Evaluation {
         format: FORMAT,
         views: measured,
         gaussians,
-        adapter,
-        seams_json,
-        cover_json,
-        clear_gains,
+        adapter: gpu.adapter().name.clone(),
+        clear_gains: gains.map_or_else(Vec::new, |gains| gains.to_vec()),
+        ..Evaluation::default()
     };
+    let (mut seams, cover) = (seams.map(SeamRun::sums), cover.sums());
+    if is_part {
+        if let Some(seams) = &mut seams {
+            seams.thin(MOST_STEPS);
+            evaluation.seam_sums_json = json("at borders", seams)?;
+        }
+        evaluation.cover_sums_json = json("of cover", &cover)?;
+    } else {
+        if let Some(seams) = seams {
+            evaluation.seams_json = json("at borders", &seams.report())?;
+        }
+        evaluation.cover_json = json("of cover", &cover.report())?;
+    }
     let result = Bytes::from(evaluation.encode_to_vec());
     Ok(TaskOutput { result, gaussians, resumed_from: 0, held_out: Vec::new(), further: Vec::new() })
 }
 
+/// Measurements as JSON; `what` they are is for the error.
+fn json(what: &str, measured: &impl Serialize) -> Result<String, TaskError> {
+    serde_json::to_string(measured).map_err(|error| TaskError::Failed {
+        class: FailClass::Training,
+        message: format!("the measurements {what} cannot be written: {error}"),
+    })
+}
+
 /// Gains that make pictures of J neither clipped nor dim ([`white_point`]); 1 if no surface gives a
-/// reference. Only pictures for viewing use them, no measurement does.
+/// reference. Only pictures for viewing use them, no measurement does. `held_out` are indices of `cameras`.
 fn gains_of(
     renderer: &mut Renderer,
     clear: WaterView,
-    views: &dyn ViewSource,
+    cameras: &[(PinholeCamera, Pose)],
+    held_out: &[u32],
 ) -> Result<[f64; 3], TaskError> {
     let mut exposure = Exposure::after([1.0; 3]);
     renderer.set_water(Some(clear));
-    let views = views.views();
-    for view in views.iter().step_by(views.len().div_ceil(EXPOSED_VIEWS).max(1)) {
-        let (width, height) = (view.camera.width.div_ceil(2), view.camera.height.div_ceil(2));
-        let rendered = renderer.render(&view.camera.resized(width, height), &view.pose, BACKGROUND)?;
+    for index in held_out.iter().step_by(held_out.len().div_ceil(EXPOSED_VIEWS).max(1)) {
+        let (camera, pose) = cameras.get(*index as usize).ok_or_else(|| {
+            input_fault(format!("view {index} is held out, and the manifest has {} views", cameras.len()))
+        })?;
+        let (width, height) = (camera.width.div_ceil(2), camera.height.div_ceil(2));
+        let rendered = renderer.render(&camera.resized(width, height), pose, BACKGROUND)?;
         exposure.add(&rendered.rgb, &rendered.alpha);
     }
     Ok(exposure.gains().unwrap_or_else(|error| {

@@ -445,6 +445,7 @@ conformance!(
     progress_is_seen_and_belongs_to_the_lease,
     partitions_resume_their_first_part_after_one_exchange,
     borders_are_trained_before_evaluation_and_change_the_model,
+    an_evaluation_in_parts_ends_with_the_last_of_them,
     a_stage_that_fails_for_good_ends_the_job,
     a_paused_job_assigns_nothing_and_accepts_results,
     the_duration_of_a_stage_excludes_pauses,

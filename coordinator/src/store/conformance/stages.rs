@@ -118,6 +118,44 @@ pub async fn borders_are_trained_before_evaluation_and_change_the_model(store: A
     );
 }
 
+pub async fn an_evaluation_in_parts_ends_with_the_last_of_them(store: Arc<dyn Store>) {
+    let store = store.as_ref();
+    let mut output = planned(2);
+    let tasks = &mut output.planned.as_mut().unwrap().tasks;
+    tasks.remove(&Stage::Evaluate.task());
+    let parts = [1, 2, 3].map(|part| Stage::Evaluate.task_of(part));
+    for part in parts {
+        tasks.insert(part, PlannedTask::new(blob(&part.to_string()), 0));
+    }
+    let id = job_of(store, 1, output).await;
+    for task in [Stage::Global.task(), Stage::Partition.task_of(0), Stage::Partition.task_of(1)] {
+        do_next(store, task, T0 + 20).await;
+    }
+    let merge = claim(store, &Stage::own(), T0 + 30).await.unwrap().lease;
+    store.complete(&merge, merged(), T0 + 40).await.unwrap();
+    // All parts are leased at once, each with the model, and a lost one is evaluated again alone.
+    let mut leases = Vec::new();
+    for part in parts {
+        let grant = claim(store, &Stage::of_workers(), T0 + 50).await.unwrap();
+        assert_eq!((grant.lease.task, grant.job.output(Artifact::Model)), (part, Some(&blob("model"))));
+        leases.push(grant.lease);
+    }
+    assert!(claim(store, &every_stage(), T0 + 50).await.is_none(), "work beside the evaluation");
+    for lease in &leases[1..] {
+        store.complete(lease, result_of(lease.task), T0 + 60).await.unwrap();
+    }
+    assert_eq!(store.sweep(T0 + 60 + LEASE_MS).await.unwrap(), [(leases[0].clone(), Expired::Silent)]);
+    assert_eq!(store.job(&id).await.unwrap().job.stage, Stage::Evaluate);
+    do_next(store, parts[0], T0 + 3000).await;
+    let view = store.job(&id).await.unwrap();
+    assert_eq!((view.job.stage, view.job.output(Artifact::Evaluation)), (Stage::Artifacts, None));
+    let done = view.tasks.iter().filter_map(|(task, _)| match &task.state {
+        TaskState::Done { result, .. } if task.task.stage == Stage::Evaluate => Some(result.clone()),
+        _ => None,
+    });
+    assert_eq!(done.collect::<Vec<_>>(), parts.map(|part| blob(&part.to_string())));
+}
+
 pub async fn a_stage_that_fails_for_good_ends_the_job(store: Arc<dyn Store>) {
     let store = store.as_ref();
     let before = [

@@ -303,7 +303,7 @@ async fn slow_tasks(
     conn: &mut PgConnection,
     given_ms: Option<i64>,
 ) -> Result<Vec<Slow>, StoreError> {
-    let with_siblings: Vec<Stage> = Stage::all().filter(|stage| stage.spec().per_partition).collect();
+    let with_siblings: Vec<Stage> = Stage::all().filter(|stage| stage.is_per_partition()).collect();
     let numbers = stages(&with_siblings);
     let found: Vec<(String, String)> = sqlx::query_as(jobs_in_turn!(
         "EXISTS (SELECT 1 FROM tasks WHERE tasks.leased_job = jobs.job_id \

@@ -21,22 +21,19 @@ pub fn stages(of: &[Stage]) -> Vec<i16> {
     sorted.into_iter().map(stage).collect()
 }
 
-/// The partition of a task in keys.
+/// The part of a task in keys.
 pub fn part(task: TaskId) -> i64 {
-    task.partition.unwrap_or(0).into()
+    task.number().into()
 }
 
 /// The task of a key.
 pub fn task_of(stage_number: i16, part: i64) -> Result<TaskId, StoreError> {
     let corrupt = || StoreError::Corrupt {
         tree: "leases",
-        message: format!("a task of stage {stage_number}, partition {part}"),
+        message: format!("a task of stage {stage_number}, part {part}"),
     };
     let found = Stage::all().find(|known| stage(*known) == stage_number).ok_or_else(corrupt)?;
-    match found.spec().per_partition {
-        true => Ok(found.task_of(u32::try_from(part).map_err(|_| corrupt())?)),
-        false => Ok(found.task()),
-    }
+    u32::try_from(part).ok().and_then(|number| found.numbered(number)).ok_or_else(corrupt)
 }
 
 /// Numbers beyond the range of a column are larger than any that occurs.

@@ -86,7 +86,7 @@ pub fn abort(error: StoreError) -> ConflictableTransactionError<StoreError> {
 pub fn task_key(id: &JobId, task: TaskId) -> Vec<u8> {
     let mut key = id.as_str().as_bytes().to_vec();
     key.push(task.stage as u8);
-    key.extend_from_slice(&task.partition.unwrap_or(0).to_be_bytes());
+    key.extend_from_slice(&task.number().to_be_bytes());
     key
 }
 
