@@ -46,9 +46,11 @@ simulate: ## coordinator, workers and users over a simulated network: SEEDS=1000
 	@cargo build --workspace --bin fathom-simulation
 	FATHOM_SIMULATION_SEEDS="$${SEEDS:-10000}" FATHOM_SIMULATION_SEED="$${SEED:-}" "$${CARGO_TARGET_DIR:-target}/debug/fathom-simulation"
 
-soak: build ## random kills of real processes during FATHOM_KILLS_ROUNDS=40 jobs, a week of calls, FATHOM_POWER_CUTS=10000 power cuts; half an hour
+soak: build ## random kills of real processes during FATHOM_KILLS_ROUNDS=40 jobs, all kills on PostgreSQL and a bucket, a week of calls and of jobs, FATHOM_POWER_CUTS=10000 power cuts; an hour
 	@cargo test --workspace --test kills soak:: -- --ignored --nocapture
+	FATHOM_KILLS_STORE=postgres cargo test --workspace --test kills
 	cargo test --workspace --test week -- --ignored --nocapture
+	cargo test --workspace --test cluster memory:: -- --ignored --nocapture --test-threads=1
 	cargo test -p fathom-coordinator --test power_cuts -- --ignored --nocapture
 
 bench: build ## times of the trainer on this machine, compared with BASELINE=<commit>

@@ -257,14 +257,13 @@ async fn write_once(
     may_be_direct: &mut bool,
 ) -> std::result::Result<bool, WriteFault> {
     let arrived = query(client, blob).await.map_err(WriteFault::Call)?;
-    if arrived.direct
-        && std::mem::take(may_be_direct)
-        && client.direct.is_wanted()
-        && client.direct.upload(&client.uploads, &to_proto(blob), "", content.clone()).await
-    {
-        return Ok(true);
+    let mut begin = arrived.committed_size_bytes;
+    if arrived.direct && std::mem::take(may_be_direct) && client.direct.is_wanted() {
+        begin = client.direct.upload(&client.uploads, &to_proto(blob), "", content.clone(), begin).await;
+        if begin == blob.bytes {
+            return Ok(true);
+        }
     }
-    let begin = arrived.committed_size_bytes;
     let (sender, receiver) = tokio::sync::mpsc::channel(4);
     let (target, content) = (blob.clone(), content.clone());
     let reader = tokio::spawn(async move { send_pieces(&target, &content, begin, &sender).await });

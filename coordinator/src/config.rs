@@ -27,6 +27,9 @@ pub struct CoordinatorConfig {
     /// Whether workers and people may send files to a bucket and fetch them from there themselves, by URLs
     /// that the coordinator signs for a minute. Default true.
     pub direct_transfers: bool,
+    /// Least length of an upload to a bucket that clients make themselves, bytes: shorter ones cost more
+    /// requests than they save. Default 8 MiB.
+    pub direct_uploads_from_bytes: u64,
     /// Where to listen; port 0 takes a free one. Default 127.0.0.1:7420.
     pub listen: SocketAddr,
     /// Where to serve metrics and health over HTTP, neither encrypted nor authenticated; port 0 takes a free
@@ -104,6 +107,7 @@ impl Default for CoordinatorConfig {
             store_connections: 32,
             objects: None,
             direct_transfers: true,
+            direct_uploads_from_bytes: 8 << 20,
             listen: SocketAddr::from((Ipv4Addr::LOCALHOST, 7420)),
             metrics_listen: None,
             scaler_listen: None,

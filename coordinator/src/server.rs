@@ -161,7 +161,7 @@ pub async fn serve(config: CoordinatorConfig) -> Result<Coordinator, Coordinator
     data_dir::make(&config.data_dir)?;
     let at = ObjectsAt::parse(config.objects.as_deref(), &config.data_dir)?.signed_by(|signing| {
         let signing = if tls.is_some() { signing.with_tls() } else { signing };
-        config.direct_transfers.then_some(signing)
+        config.direct_transfers.then(|| signing.writing_from(config.direct_uploads_from_bytes))
     });
     let store = open_store(&config, &at).await?;
     at.hold_for(&store.deployment().await?, &config.data_dir).await?;

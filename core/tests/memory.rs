@@ -1,6 +1,5 @@
 //! The memory of a long run. It needs its own process, because resident memory includes all threads.
 #![cfg(target_os = "linux")]
-#![expect(clippy::unwrap_used, reason = "the helpers of a test fail by panicking")]
 
 use std::sync::Arc;
 
@@ -11,10 +10,9 @@ use fathom_core::train::{TrainRun, Trainer};
 use fathom_core::views::TrainView;
 use fathom_twins::samples::{grey, off_centre_view, random};
 
-fn resident_mib() -> f64 {
-    let pages = std::fs::read_to_string("/proc/self/statm").unwrap();
-    pages.split(' ').nth(1).unwrap().parse::<f64>().unwrap() * 4096.0 / f64::from(1 << 20)
-}
+#[path = "../../tests/support/memory.rs"]
+mod resident;
+use resident::resident_mib;
 
 /// On lavapipe, a branch that depends only on a uniform costs a copy of its kernel at every dispatch (see
 /// `veiled` in shaders/shared/frame.wgsl). The copies are never released: at least 0.3 MiB per iteration, 60

@@ -6,6 +6,7 @@
 use std::collections::HashMap;
 use std::error::Error;
 use std::io;
+use std::ops::Range;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 use std::time::Duration;
@@ -15,7 +16,7 @@ use futures::{StreamExt as _, stream};
 use http::StatusCode;
 use http::header::{CONTENT_RANGE, RANGE};
 use reqwest::Body;
-use tokio::io::AsyncReadExt as _;
+use tokio::io::{AsyncReadExt as _, AsyncSeekExt as _};
 use tokio::sync::watch;
 use tokio::time::{Instant, timeout};
 use tonic::Status;
@@ -117,58 +118,80 @@ impl Direct {
         Ok(Pieces { response, missing: bytes })
     }
 
-    /// Sends a whole blob to the bucket, after QueryBlob has offered it. False if the coordinator does not
-    /// sign, or anything fails: then it has to be sent with WriteBlob.
+    /// Sends a blob from byte `arrived` on to the bucket, after QueryBlob has offered it. Returns where what
+    /// has arrived now ends. The rest has to be sent with WriteBlob; there is none if the blob is complete.
     pub async fn upload(
         &self,
         client: &UploadServiceClient<Connection>,
         blob: &v1::BlobRef,
         job_id: &str,
         content: Content,
-    ) -> bool {
-        match self.try_upload(client.clone(), blob, job_id, content).await {
-            Ok(is_complete) => is_complete,
-            // The coordinator did its part, or says why not when the blob is sent to it.
-            Err(DirectError::Coordinator(status)) => {
-                let reason = status.message();
-                tracing::warn!(
-                    digest = blob.digest,
-                    reason,
-                    "sending a file through the coordinator instead"
-                );
-                false
-            }
-            Err(error) => {
-                self.failed(&error);
-                false
+        arrived: u64,
+    ) -> u64 {
+        let mut end = arrived;
+        while end < blob.size_bytes {
+            match self.upload_part(client.clone(), blob, job_id, &content, end).await {
+                Ok(Some(next)) => end = next,
+                Ok(None) => return end,
+                // The coordinator did its part, or says why not when the blob is sent to it.
+                Err(DirectError::Coordinator(status)) => {
+                    let reason = status.message();
+                    tracing::warn!(
+                        digest = blob.digest,
+                        reason,
+                        "sending a file through the coordinator instead"
+                    );
+                    return end;
+                }
+                Err(error) => {
+                    self.failed(&error);
+                    return end;
+                }
             }
         }
+        end
     }
 
-    async fn try_upload(
+    /// Sends what one request takes from `offset` on; returns its end, or `None` if the coordinator signs
+    /// nothing.
+    async fn upload_part(
         &self,
         mut client: UploadServiceClient<Connection>,
         blob: &v1::BlobRef,
         job_id: &str,
-        content: Content,
-    ) -> Result<bool, DirectError> {
+        content: &Content,
+        offset: u64,
+    ) -> Result<Option<u64>, DirectError> {
         let refused = |status| DirectError::Coordinator(Box::new(status));
-        let request = v1::SignWriteRequest { blob: Some(blob.clone()), job_id: job_id.to_owned() };
+        let request = v1::SignWriteRequest {
+            blob: Some(blob.clone()),
+            job_id: job_id.to_owned(),
+            offset_bytes: offset,
+            in_parts: true,
+        };
         let signed = client.sign_write(request).await.map_err(refused)?.into_inner();
-        if signed.complete || signed.url.is_empty() {
-            return Ok(signed.complete);
+        if signed.complete {
+            return Ok(Some(blob.size_bytes));
         }
-        self.put(&signed.url, &signed.headers, content, blob.size_bytes).await?;
+        if signed.url.is_empty() {
+            return Ok(None);
+        }
+        let rest = blob.size_bytes - offset;
+        // Coordinators that knew no parts leave the length out.
+        let bytes = if signed.size_bytes == 0 { rest } else { rest.min(signed.size_bytes) };
+        let range = offset..offset + bytes;
+        self.put(&signed.url, &signed.headers, content, range.clone()).await?;
         let request = v1::FinishWriteRequest {
             blob: Some(blob.clone()),
             upload: signed.upload,
             job_id: job_id.to_owned(),
+            offset_bytes: offset,
         };
         client.finish_write(request).await.map_err(refused)?;
-        Ok(true)
+        Ok(Some(range.end))
     }
 
-    /// Writes an object of `bytes`.
+    /// Writes an object of the bytes `range` of `content`.
     ///
     /// # Errors
     /// When the bucket does not answer or refuses.
@@ -176,14 +199,15 @@ impl Direct {
         &self,
         url: &str,
         headers: &HashMap<String, String>,
-        content: Content,
-        bytes: u64,
+        content: &Content,
+        range: Range<u64>,
     ) -> Result<(), DirectError> {
         let taken = watch::Sender::new(Instant::now());
         let noted = taken.clone();
+        let bytes = range.end - range.start;
         let body = match content {
-            Content::Bytes(bytes) => pieces_of_bytes(bytes).boxed(),
-            Content::File(path) => pieces_of_file(path).boxed(),
+            Content::Bytes(bytes) => pieces_of_bytes(bytes.clone(), range).boxed(),
+            Content::File(path) => pieces_of_file(path.clone(), range).boxed(),
         };
         let mut missing = bytes;
         let body = Body::wrap_stream(body.inspect(move |piece| {
@@ -266,21 +290,36 @@ async fn stuck(taken: &watch::Sender<Instant>) {
     }
 }
 
-fn pieces_of_bytes(bytes: Bytes) -> impl stream::Stream<Item = io::Result<Bytes>> + Send + 'static {
-    let starts = (0..bytes.len()).step_by(PIECE);
-    stream::iter(starts.map(move |at| Ok(bytes.slice(at..bytes.len().min(at + PIECE)))))
+/// A range of some bytes, piece by piece; less if there are fewer.
+fn pieces_of_bytes(
+    bytes: Bytes,
+    range: Range<u64>,
+) -> impl stream::Stream<Item = io::Result<Bytes>> + Send + 'static {
+    let in_memory = |at: u64| usize::try_from(at).map_or(bytes.len(), |at| at.min(bytes.len()));
+    let (start, end) = (in_memory(range.start), in_memory(range.end));
+    stream::iter((start..end).step_by(PIECE).map(move |at| Ok(bytes.slice(at..end.min(at + PIECE)))))
 }
 
-/// The bytes of a file, piece by piece.
-fn pieces_of_file(path: PathBuf) -> impl stream::Stream<Item = io::Result<Bytes>> + Send + 'static {
-    stream::try_unfold((None, path), |(opened, path)| async {
-        let mut file = match opened {
-            Some(file) => file,
-            None => tokio::fs::File::open(&path).await?,
-        };
-        let mut piece = Vec::new();
-        let read = (&mut file).take(PIECE as u64).read_to_end(&mut piece).await?;
-        Ok((read > 0).then(|| (Bytes::from(piece), (Some(file), path))))
+/// The same of a file.
+fn pieces_of_file(
+    path: PathBuf,
+    range: Range<u64>,
+) -> impl stream::Stream<Item = io::Result<Bytes>> + Send + 'static {
+    stream::try_unfold((None, path), move |(opened, path)| {
+        let range = range.clone();
+        async move {
+            let mut file = match opened {
+                Some(file) => file,
+                None => {
+                    let mut file = tokio::fs::File::open(&path).await?;
+                    file.seek(io::SeekFrom::Start(range.start)).await?;
+                    file.take(range.end - range.start)
+                }
+            };
+            let mut piece = Vec::new();
+            let read = (&mut file).take(PIECE as u64).read_to_end(&mut piece).await?;
+            Ok((read > 0).then(|| (Bytes::from(piece), (Some(file), path))))
+        }
     })
 }
 
@@ -369,18 +408,24 @@ mod tests {
         let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
         let url = format!("http://{}/secret", listener.local_addr().unwrap());
         let folder = tempfile::tempdir().unwrap();
-        let content: Vec<u8> = (0..3 * PIECE as u32 + 5).map(|byte| byte as u8).collect();
+        let whole: Vec<u8> = (0..3 * PIECE as u32 + 5).map(|byte| (byte / 251) as u8).collect();
         let path = folder.path().join("content");
-        std::fs::write(&path, &content).unwrap();
-        let of_bytes = Content::Bytes(content.clone().into());
-        for sent in [of_bytes, Content::File(path)] {
+        std::fs::write(&path, &whole).unwrap();
+        let (of_bytes, of_file) = (Content::Bytes(whole.clone().into()), Content::File(path));
+        for (sent, start, end) in [
+            (&of_bytes, 0, whole.len()),
+            (&of_file, 0, whole.len()),
+            (&of_bytes, 1000, PIECE + 1000),
+            (&of_file, 1000, PIECE + 2000),
+        ] {
+            let content = &whole[start..end];
             let headers = HashMap::from([("content-length".to_owned(), content.len().to_string())]);
             let direct = Direct::default();
-            let put = direct.put(&url, &headers, sent, content.len() as u64);
+            let put = direct.put(&url, &headers, sent, start as u64..end as u64);
             let taken = async {
                 let (mut socket, _) = listener.accept().await.unwrap();
                 let mut all = Vec::new();
-                while !all.ends_with(&content) {
+                while !all.ends_with(content) {
                     assert!(socket.read_buf(&mut all).await.unwrap() > 0, "{} bytes", all.len());
                 }
                 socket.write_all(b"HTTP/1.1 200 OK\r\ncontent-length: 0\r\n\r\n").await.unwrap();
@@ -400,7 +445,7 @@ mod tests {
         let url = format!("http://{}/secret", listener.local_addr().unwrap());
         let content = Content::Bytes(vec![7; 64 << 20].into());
         let begun = Instant::now();
-        let stuck = Direct::default().put(&url, &HashMap::new(), content, 64 << 20).await.unwrap_err();
+        let stuck = Direct::default().put(&url, &HashMap::new(), &content, 0..64 << 20).await.unwrap_err();
         assert!(stuck.to_string().contains("no byte for 10 s"), "{stuck}");
         assert!(begun.elapsed() < Duration::from_secs(40), "{:?}", begun.elapsed());
     }

@@ -13,6 +13,11 @@ mod datasets;
 mod hostile;
 mod jobs;
 mod leaving;
+mod memory;
+#[path = "../support/postgres.rs"]
+mod postgres;
+#[path = "../support/memory.rs"]
+mod resident;
 mod scaler;
 mod session;
 mod several_gpus;

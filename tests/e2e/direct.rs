@@ -44,7 +44,9 @@ fn large_files_bypass_the_coordinator_and_are_still_checked() {
     let start = |more: &[&str]| {
         let metrics = format!("127.0.0.1:{}", free_port());
         let flags = ["coordinator", "--listen=127.0.0.1:0", "--data-dir", &data, "--objects", &objects];
-        let flags = [&flags[..], &["--metrics-listen", &metrics], more].concat();
+        // The model of this job has 300 kB.
+        let own = ["--metrics-listen", &metrics, "--direct-uploads-from-bytes=262144"];
+        let flags = [&flags[..], &own, more].concat();
         let mut service = Service::with_environment(&flags, Stdio::piped(), Stdio::inherit(), &keys);
         let url = service.wait_until_it_listens();
         (service, url, metrics)

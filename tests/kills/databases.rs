@@ -23,7 +23,7 @@ fn a_database_killed_twice_in_a_job_costs_no_task() {
     let lease = Duration::from_millis(harness.rules.lease_ms);
     // Longer than a lease: nobody could renew meanwhile, and that is no silence.
     harness.kill_database(lease * 2);
-    job.wait_for_checkpoint("partition-0001");
+    job.wait_until_leased("partition-0001");
     harness.kill_database(lease / 4);
     let history = harness.succeeded(&job);
     assert_eq!(history.losses(), 0, "a live worker was counted as lost\n{history}");
@@ -50,7 +50,7 @@ fn a_bucket_that_fails_costs_no_task() {
     std::thread::sleep(lease * 4);
     // To the end of the job, and while its model is fetched, every third request fails.
     harness.bucket().break_every(3, Some(Fault::Status(500)));
-    job.wait_for_checkpoint("partition-0001");
+    job.wait_until_leased("partition-0001");
     harness.bucket().break_every(3, Some(Fault::Truncated));
     let history = harness.succeeded(&job);
     harness.bucket().break_every(3, None);
@@ -113,6 +113,27 @@ fn a_coordinator_cut_off_from_its_database_sends_workers_on() {
         assert!(Instant::now() < deadline, "it admits nobody:\n{}", harness.log_of("second-coordinator"));
         std::thread::sleep(Duration::from_millis(200));
     }
+    harness.check_what_is_kept();
+}
+
+#[test]
+fn a_lone_coordinator_waits_for_the_way_to_its_database() {
+    let scenario = "a_lone_coordinator_waits_for_the_way_to_its_database";
+    if !can_train(scenario) {
+        return;
+    }
+    let Some((mut harness, network)) = Harness::behind_a_network(scenario) else { return };
+    harness.start_worker("first");
+    let job = harness.submit();
+    job.wait_for_checkpoint("partition-0000");
+    network.set(true);
+    // Longer than a lease: nobody could renew meanwhile, and that is no silence.
+    std::thread::sleep(Duration::from_millis(harness.rules.lease_ms * 2));
+    let log = harness.log_of("coordinator");
+    assert!(log.contains("the database is not available; calls are refused"), "{log}");
+    network.set(false);
+    let history = harness.succeeded(&job);
+    assert_eq!(history.losses(), 0, "a live worker was counted as lost\n{history}");
     harness.check_what_is_kept();
 }
 

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use crate::files::flip_a_bit;
-use crate::harness::{Harness, Rules};
+use crate::harness::{Harness, Rules, has_data_directory};
 use crate::process::Process;
 use crate::processes::can_train;
 use crate::small_disk::{SmallDisk, wait_for};
@@ -11,7 +11,7 @@ use crate::small_disk::{SmallDisk, wait_for};
 #[test]
 fn a_full_disk_refuses_new_jobs_and_the_running_one_continues() {
     let scenario = "a_full_disk_refuses_new_jobs_and_the_running_one_continues";
-    if !can_train(scenario) {
+    if !can_train(scenario) || !has_data_directory(scenario) {
         return;
     }
     let mut harness = Harness::new(scenario);
@@ -41,7 +41,7 @@ fn a_full_disk_refuses_new_jobs_and_the_running_one_continues() {
 #[test]
 fn a_disk_full_to_the_last_byte_loses_nothing() {
     let scenario = "a_disk_full_to_the_last_byte_loses_nothing";
-    if !can_train(scenario) {
+    if !can_train(scenario) || !has_data_directory(scenario) {
         return;
     }
     let mut harness = Harness::stopped(scenario, Rules::default());

@@ -12,12 +12,13 @@ use fathom_core::scene::BlobRef;
 use fathom_invariants::Fact;
 use serde_json::Value;
 
+use crate::cut::Cut;
 use crate::files::{copy, files_in};
 use crate::history::{History, seen};
 use crate::job::Job;
 use crate::postgres::{Disk, Server};
 use crate::process::{Process, Random};
-use crate::processes::{fathom, fathom_of, free_port, output_of, under};
+use crate::processes::{fathom, fathom_of, free_port, output_from, output_of, under};
 use crate::reference;
 use crate::s3::S3Server;
 
@@ -63,6 +64,8 @@ pub struct Harness {
     database: Option<(Server, String)>,
     /// The server of its files; without one, they are in the data directory.
     bucket: Option<S3Server>,
+    /// Whether workers and clients use the bucket themselves, also for the small files of these scenarios.
+    is_direct: bool,
     workers: BTreeMap<String, Process>,
     /// What its clients were answered, by the time since its start.
     facts: Vec<(Duration, Fact)>,
@@ -83,6 +86,23 @@ fn job_id(id: &str) -> JobId {
 fn seed() -> u64 {
     let now = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |now| now.subsec_nanos());
     std::env::var("FATHOM_KILLS_SEED").ok().and_then(|seed| seed.parse().ok()).unwrap_or(now.into())
+}
+
+/// Leases on a database last at least this long, milliseconds: longer than a pool takes to connect again.
+const LEASE_ON_DATABASE_MS: u64 = 3000;
+
+/// Whether `FATHOM_KILLS_STORE=postgres` puts jobs into a database and files into a bucket, in the scenarios
+/// that need neither.
+fn is_on_database() -> bool {
+    std::env::var("FATHOM_KILLS_STORE").is_ok_and(|store| store == "postgres")
+}
+
+/// Whether jobs and files of such a scenario are in a data directory; says that it skips the scenario if not.
+pub fn has_data_directory(scenario: &str) -> bool {
+    if is_on_database() {
+        eprintln!("{scenario}: skipped, since it is about the disk of a data directory");
+    }
+    !is_on_database()
 }
 
 impl Harness {
@@ -108,26 +128,39 @@ impl Harness {
     pub fn on_database_of(scenario: &'static str, program: Option<PathBuf>) -> Option<Self> {
         let server = Server::start(Disk::Synced)?;
         let url = server.database();
-        // Longer than a pool takes to connect again.
-        let mut harness = Self::stopped(scenario, Rules { lease_ms: 3000, ..Rules::default() });
-        harness.database = Some((server, url));
-        harness.bucket = Some(S3Server::start());
+        Some(Self::on(scenario, server, url, S3Server::start(), program))
+    }
+
+    /// As [`Harness::on_database`], with a network to the database that can be cut.
+    pub fn behind_a_network(scenario: &'static str) -> Option<(Self, Cut)> {
+        let server = Server::start(Disk::Synced)?;
+        let network = Cut::to(server.folder());
+        let url = network.url(&server.database());
+        Some((Self::on(scenario, server, url, S3Server::start(), None), network))
+    }
+
+    fn on(
+        scenario: &'static str,
+        server: Server,
+        url: String,
+        bucket: S3Server,
+        program: Option<PathBuf>,
+    ) -> Self {
+        let mut harness = Self::of(scenario, Rules::default());
+        harness.give_engines(server, url, bucket);
+        harness.is_direct = true;
         harness.program = program;
         harness.start_coordinator();
-        Some(harness)
+        harness
     }
 
     /// A service of what another one had, on this machine: a dump of its database, and a copy of its bucket.
     pub fn restored(scenario: &'static str, dump: &Path, bucket: &Path) -> Option<Self> {
         let server = Server::start(Disk::Synced)?;
         let url = server.restored(dump);
-        let mut harness = Self::stopped(scenario, Rules { lease_ms: 3000, ..Rules::default() });
         let files = S3Server::start();
         copy(bucket, &files.folder(PREFIX));
-        harness.database = Some((server, url));
-        harness.bucket = Some(files);
-        harness.start_coordinator();
-        Some(harness)
+        Some(Self::on(scenario, server, url, files, None))
     }
 
     /// Copies all files of its bucket.
@@ -137,6 +170,22 @@ impl Harness {
 
     /// Starts no process yet.
     pub fn stopped(scenario: &'static str, rules: Rules) -> Self {
+        let mut harness = Self::of(scenario, rules);
+        if is_on_database() {
+            let server = Server::start(Disk::Synced).expect("PostgreSQL, for FATHOM_KILLS_STORE=postgres");
+            let url = server.database();
+            harness.give_engines(server, url, S3Server::start());
+        }
+        harness
+    }
+
+    fn give_engines(&mut self, server: Server, url: String, bucket: S3Server) {
+        self.database = Some((server, url));
+        self.bucket = Some(bucket);
+        self.rules.lease_ms = self.rules.lease_ms.max(LEASE_ON_DATABASE_MS);
+    }
+
+    fn of(scenario: &'static str, rules: Rules) -> Self {
         let folder = tempfile::tempdir().expect("a temporary folder");
         let seed = seed();
         Self {
@@ -152,6 +201,7 @@ impl Harness {
             second: None,
             database: None,
             bucket: None,
+            is_direct: false,
             workers: BTreeMap::new(),
             facts: Vec::new(),
             begin: Instant::now(),
@@ -273,7 +323,7 @@ impl Harness {
         ready
     }
 
-    fn command(&self, arguments: &[String]) -> Command {
+    fn command<S: AsRef<str>>(&self, arguments: &[S]) -> Command {
         match &self.program {
             Some(program) => fathom_of(program, arguments),
             None => fathom(arguments),
@@ -289,9 +339,14 @@ impl Harness {
         self.kills += 1;
     }
 
-    /// Variables that the coordinator needs for its bucket.
+    /// Variables that the coordinator needs for its bucket. Coordinators of other versions may not know all
+    /// of them.
     fn environment(&self) -> Vec<(&'static str, String)> {
-        self.bucket.iter().flat_map(S3Server::environment).collect()
+        let transfers = [
+            ("FATHOM_DIRECT_TRANSFERS", self.is_direct.to_string()),
+            ("FATHOM_DIRECT_UPLOADS_FROM_BYTES", "262144".to_owned()),
+        ];
+        self.bucket.iter().flat_map(S3Server::environment).chain(transfers).collect()
     }
 
     pub fn has_database(&self) -> bool {
@@ -366,10 +421,7 @@ impl Harness {
     pub fn call(&self, words: &[&str]) -> Output {
         let url = self.url();
         let words = [words, &["--coordinator", &url]].concat();
-        match &self.program {
-            Some(program) => fathom_of(program, &words).output().expect("the binary starts"),
-            None => output_of(&words),
-        }
+        output_from(self.command(&words))
     }
 
     /// The same; it must succeed.
@@ -477,21 +529,33 @@ impl Harness {
 
     // Contents of the disk
 
-    /// The file of a blob, in the data directory or in the folder of the bucket.
-    fn blob(&self, tenant: &Tenant, blob: &BlobRef) -> PathBuf {
+    /// Where a tenant's files are: in the data directory, or in the folder of the bucket.
+    fn objects(&self, tenant: &Tenant) -> PathBuf {
         let root = self.bucket.as_ref().map_or_else(|| self.data.clone(), |bucket| bucket.folder(PREFIX));
-        TenantBlobs::folder(&root, tenant).join("cas").join(&blob.digest[..2]).join(&blob.digest)
+        TenantBlobs::folder(&root, tenant)
+    }
+
+    /// The file of a blob.
+    fn blob(&self, tenant: &Tenant, blob: &BlobRef) -> PathBuf {
+        self.objects(tenant).join("cas").join(&blob.digest[..2]).join(&blob.digest)
     }
 
     /// Complete blobs, with their names.
     pub fn blobs(&self) -> Vec<PathBuf> {
-        let folders = files_in(&self.data.join("objects/cas"));
+        let folders = files_in(&self.objects(&Tenant::default()).join("cas"));
         folders.iter().flat_map(|folder| files_in(folder)).collect()
     }
 
-    /// Incomplete uploads.
-    pub fn partial_uploads(&self) -> Vec<PathBuf> {
-        files_in(&self.data.join("objects/uploads"))
+    /// Lengths of incomplete uploads, bytes.
+    pub fn partial_uploads(&self) -> Vec<u64> {
+        let length = |path: &PathBuf| path.metadata().map_or(0, |file| file.len());
+        let uploads = files_in(&self.objects(&Tenant::default()).join("uploads"));
+        if self.bucket.is_none() {
+            return uploads.iter().map(length).collect();
+        }
+        // A folder of segments each.
+        let segments = uploads.iter().map(|folder| files_in(folder)).filter(|files| !files.is_empty());
+        segments.map(|files| files.iter().map(length).sum()).collect()
     }
 
     /// Stalls the next merge of a job before its first byte: it opens a pipe without a reader.

@@ -7,7 +7,8 @@
 //! times come from a seed; a scenario that fails prints it, with the last lines of every log, and
 //! `FATHOM_KILLS_SEED=... cargo test --test kills NAME` replays it.
 //!
-//! `make soak` kills for longer (`FATHOM_KILLS_ROUNDS`).
+//! With `FATHOM_KILLS_STORE=postgres`, all of them have their jobs in PostgreSQL and files in a bucket, as
+//! some always do. `make soak` does that, and kills for longer (`FATHOM_KILLS_ROUNDS`).
 #![cfg(unix)]
 
 #[path = "../support/postgres.rs"]

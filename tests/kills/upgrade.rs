@@ -17,6 +17,9 @@ fn other_version() -> PathBuf {
 
 /// Two coordinators and a worker of the other version, and a job that has begun to train its partitions.
 fn begun(scenario: &'static str) -> Option<(Harness, Job)> {
+    if !can_train(scenario) {
+        return None;
+    }
     let mut harness = Harness::on_database_of(scenario, Some(other_version()))?;
     harness.announce_second();
     harness.start_second();
@@ -54,11 +57,7 @@ fn ends(mut harness: Harness, job: &Job) {
 #[test]
 #[ignore = "needs another version; run `scripts/rolling_upgrade.sh COMMIT`"]
 fn coordinators_are_upgraded_first_and_a_job_goes_on() {
-    let scenario = "coordinators_are_upgraded_first_and_a_job_goes_on";
-    if !can_train(scenario) {
-        return;
-    }
-    let Some((mut harness, job)) = begun(scenario) else { return };
+    let Some((mut harness, job)) = begun("coordinators_are_upgraded_first_and_a_job_goes_on") else { return };
     replace_coordinators(&mut harness);
     // The old worker goes on with the new coordinators before it is replaced.
     job.wait_after(job.seen().len(), "a checkpoint", |event| event["event"] == "checkpoint");
@@ -69,11 +68,7 @@ fn coordinators_are_upgraded_first_and_a_job_goes_on() {
 #[test]
 #[ignore = "needs another version; run `scripts/rolling_upgrade.sh COMMIT`"]
 fn workers_are_upgraded_first_and_a_job_goes_on() {
-    let scenario = "workers_are_upgraded_first_and_a_job_goes_on";
-    if !can_train(scenario) {
-        return;
-    }
-    let Some((mut harness, job)) = begun(scenario) else { return };
+    let Some((mut harness, job)) = begun("workers_are_upgraded_first_and_a_job_goes_on") else { return };
     replace_worker(&mut harness);
     job.wait_for("a task of the new worker", |event| event["worker"] == "new" && event["state"] == "running");
     replace_coordinators(&mut harness);

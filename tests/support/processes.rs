@@ -63,6 +63,11 @@ pub fn output_of<S: AsRef<str>>(arguments: &[S]) -> Output {
 pub fn output_in<S: AsRef<str>>(environment: &[(&str, String)], arguments: &[S]) -> Output {
     let mut command = fathom(arguments);
     command.envs(environment.iter().map(|(name, value)| (name, value)));
+    output_from(command)
+}
+
+/// The same for a command that is not started yet.
+pub fn output_from(mut command: Command) -> Output {
     let child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn();
     let child = child.expect("the binary starts");
     let _watchdog = Watchdog::over(&child);

@@ -176,19 +176,20 @@ impl BlobClient {
         if arrived.complete {
             return Ok(true);
         }
+        let mut start = arrived.committed_size_bytes;
         if arrived.direct && std::mem::take(may_be_direct) && self.direct.is_wanted() {
             let content = match source.clone() {
                 BlobSource::Bytes(bytes) => Content::Bytes(bytes),
                 BlobSource::File(path) => Content::File(path),
             };
-            if self.direct.upload(&self.client, &to_proto(blob), &self.job_id, content).await {
+            start = self.direct.upload(&self.client, &to_proto(blob), &self.job_id, content, start).await;
+            if start == blob.bytes {
                 return Ok(true);
             }
         }
         let (sender, pieces) = mpsc::channel(PIECES_AHEAD);
         let (source, first, job_id) = (source.clone(), to_proto(blob), self.job_id.clone());
         let size = blob.bytes;
-        let start = arrived.committed_size_bytes;
         // A failing reader ends the stream without `finish`; the caller gets the reader's error.
         let read = async move {
             let mut offset = start;

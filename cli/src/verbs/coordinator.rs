@@ -52,6 +52,10 @@ pub struct CoordinatorSettings {
     /// false sends all files through the coordinator
     #[arg(long, num_args = 0..=1, default_missing_value = "true", require_equals = true, value_name = "BOOL", env = "FATHOM_DIRECT_TRANSFERS")]
     direct_transfers: Option<bool>,
+    /// Let them send only files of at least this many bytes to the bucket themselves; shorter ones cost more
+    /// requests than they save
+    #[arg(long, value_name = "BYTES", env = "FATHOM_DIRECT_UPLOADS_FROM_BYTES")]
+    direct_uploads_from_bytes: Option<u64>,
     /// Address or host name to listen on; beyond this machine it needs TLS and tokens; port 0 takes a free
     /// one
     #[arg(long, value_name = "ADDRESS:PORT", env = "FATHOM_LISTEN", value_parser = super::parse_address)]

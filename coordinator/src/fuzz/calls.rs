@@ -280,9 +280,9 @@ fn fuzzed_calls_of_uploads_are_answered_or_refused() {
     let mut corpus = corpus.to_vec();
     corpus.extend([(4, begin.encode_to_vec()), (4, by_list.encode_to_vec()), (5, wreck.clone())]);
     corpus.extend([(6, wreck.clone()), (7, page.encode_to_vec()), (8, wreck)]);
-    let sign = v1::SignWriteRequest { blob: blob(), job_id: String::new() };
+    let sign = v1::SignWriteRequest { blob: blob(), ..Default::default() };
     let finish =
-        v1::FinishWriteRequest { blob: blob(), upload: blob().unwrap().digest, job_id: String::new() };
+        v1::FinishWriteRequest { blob: blob(), upload: blob().unwrap().digest, ..Default::default() };
     corpus.extend([(9, sign.encode_to_vec()), (10, finish.encode_to_vec())]);
     fuzz("calls of UploadService", &corpus, async |shared, which, bytes| {
         let uploads = Uploads(Arc::clone(shared));

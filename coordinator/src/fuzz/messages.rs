@@ -72,8 +72,13 @@ fn fuzzed_messages_of_users_are_decoded_or_refused() {
     fuzz(v1::ListDatasetsRequest { page_size: 7, page_token: "reef/00000000".into() });
     fuzz(v1::DeleteDatasetRequest { dataset_id: "reef".into() });
     fuzz(v1::QueryBlobRequest { blob: blob(), job_id: job_id() });
-    fuzz(v1::SignWriteRequest { blob: blob(), job_id: job_id() });
-    fuzz(v1::FinishWriteRequest { blob: blob(), upload: "0".repeat(64), job_id: job_id() });
+    fuzz(v1::SignWriteRequest { blob: blob(), job_id: job_id(), offset_bytes: 0, in_parts: true });
+    fuzz(v1::FinishWriteRequest {
+        blob: blob(),
+        upload: "0".repeat(64),
+        job_id: job_id(),
+        offset_bytes: 1 << 20,
+    });
     fuzz(v1::ReadBlobRequest { digest: "0".repeat(64), offset_bytes: 3, job_id: job_id(), direct: true });
 }
 

@@ -1,12 +1,13 @@
 //! Uploads that clients send to the bucket themselves.
 //!
-//! A client gets a signed request for one object, `direct/<name>`, of the blob's length. It can write that
-//! object again and again while its URL is valid. So the bucket copies the object to where no client can
-//! write, and that copy is hashed and published, as the segment of an upload that has arrived.
+//! A client gets a signed request for one object, `direct/<name>`, of the length of the blob or of a part of
+//! it. It can write that object again and again while its URL is valid. So the bucket copies the object to
+//! where no client can write, as a segment of an upload. When all have arrived, they are hashed and
+//! published.
 //!
 //! The object counts as an upload of its own, under its name instead of a digest, with its full length. That
-//! ends when it has become a blob, or when its time is over and it is deleted. What is written later, or
-//! signed by a coordinator that dies, is deleted by garbage collection.
+//! ends when it has become a segment or a blob, or when its time is over and it is deleted. What is written
+//! later, or signed by a coordinator that dies, is deleted by garbage collection.
 
 use std::sync::{Arc, PoisonError};
 use std::time::Duration;
@@ -20,11 +21,9 @@ use uuid::Uuid;
 
 use super::bucket::Bucket;
 use super::claim::Replaced;
-use super::signing::{DIRECT_FROM_BYTES, SignedRequest};
+use super::signing::SignedRequest;
 use super::{BlobStore, BlobWriter, ObjectError, Place, WriteClaim, check_digest, segments};
 
-/// Longer blobs go through the coordinator: a request that breaks off has to be repeated as a whole.
-const DIRECT_TO_BYTES: u64 = 256 << 20;
 /// Age after which nobody else deletes an object; longer than any upload has.
 pub(super) const UNFINISHED_FOR: Duration = Duration::from_secs(1800);
 /// Most uploads of a tenant that are signed at a time.
@@ -43,14 +42,18 @@ pub struct DirectWrite {
     pub upload: String,
     /// The request that sends it.
     pub request: SignedRequest,
+    /// Its length.
+    pub bytes: u64,
 }
 
 /// An upload that is signed, and counts as long as this exists.
 pub(super) struct Signed {
     #[expect(dead_code, reason = "held for its end")]
     claim: WriteClaim,
-    /// The blob.
-    blob: BlobRef,
+    /// The digest of the blob.
+    digest: String,
+    /// Its length, which it counts.
+    bytes: u64,
 }
 
 /// The checks of a tenant's uploads.
@@ -87,35 +90,50 @@ fn path_of(upload: &str) -> ObjectPath {
 }
 
 impl BlobStore {
-    /// Whether a client may send this blob to the bucket itself, of which `arrived_bytes` have arrived.
+    /// Whether a client may send the rest of this blob to the bucket itself, of which `arrived_bytes` have
+    /// arrived.
     pub fn takes_directly(&self, blob: &BlobRef, arrived_bytes: u64) -> bool {
-        arrived_bytes == 0
-            && (DIRECT_FROM_BYTES..=DIRECT_TO_BYTES).contains(&blob.bytes)
-            && self.signing.as_ref().is_some_and(|signing| signing.signs_lengths())
+        self.signing.as_ref().is_some_and(|signing| signing.part(blob.bytes, arrived_bytes).is_some())
     }
 
-    /// Signs the upload of a blob, which counts from now on; `None` if its client has to send it here.
+    /// Whether one request to the bucket takes this whole blob.
+    pub fn takes_at_once(&self, blob: &BlobRef) -> bool {
+        self.signing.as_ref().is_some_and(|signing| signing.part(blob.bytes, 0) == Some(blob.bytes))
+    }
+
+    /// Signs the upload of a blob from `offset` on, as much as one request takes. That counts from now on.
+    /// `None` if its client has to send it here.
     ///
     /// # Errors
-    /// When the limit would be exceeded, or the database is not available.
+    /// When all that is missing of the blob would exceed the limit, or the database is not available.
     pub async fn sign_write(
         self: &Arc<Self>,
         blob: &BlobRef,
+        offset: u64,
         limit_bytes: Option<u64>,
     ) -> Result<Option<DirectWrite>, ObjectError> {
         check_digest(&blob.digest)?;
-        let (true, Some(signing)) = (self.takes_directly(blob, 0), &self.signing) else { return Ok(None) };
+        let Some(signing) = &self.signing else { return Ok(None) };
+        let Some(bytes) = signing.part(blob.bytes, offset) else { return Ok(None) };
         if self.signed.lock().unwrap_or_else(PoisonError::into_inner).len() >= MOST_SIGNED {
             return Ok(None);
         }
         let upload = name_for(&blob.digest);
-        let Some(request) = signing.to_write(&path_of(&upload), blob.bytes).await else { return Ok(None) };
+        let Some(request) = signing.to_write(&path_of(&upload), bytes).await else { return Ok(None) };
         let claim = WriteClaim::take(self, &upload)?;
-        self.reserve(&claim, blob.bytes, 0, limit_bytes, None).await?;
-        let signed = Signed { claim, blob: blob.clone() };
+        let later = blob.bytes - offset - bytes;
+        let limit_of_part = limit_bytes.map(|limit| limit.saturating_sub(later));
+        let reserved = self.reserve(&claim, bytes, 0, limit_of_part, None).await;
+        reserved.map_err(|error| match error {
+            ObjectError::OverLimit { used_bytes, .. } => {
+                ObjectError::OverLimit { used_bytes, limit_bytes: limit_bytes.unwrap_or(0) }
+            }
+            error => error,
+        })?;
+        let signed = Signed { claim, digest: blob.digest.clone(), bytes };
         self.signed.lock().unwrap_or_else(PoisonError::into_inner).insert(upload.clone(), signed);
         let (store, ended) = (Arc::clone(self), upload.clone());
-        let time = sent_within(blob.bytes);
+        let time = sent_within(bytes);
         tokio::spawn(async move {
             tokio::time::sleep(time).await;
             // Also if it has become a blob: its client may have sent the object once more.
@@ -124,21 +142,23 @@ impl BlobStore {
             }
             drop(store.take_signed(&ended));
         });
-        Ok(Some(DirectWrite { upload, request }))
+        Ok(Some(DirectWrite { upload, request, bytes }))
     }
 
-    /// Checks what a client has sent to the bucket, and makes it the blob. No caller interrupts it.
+    /// Takes what a client has sent to the bucket from `offset` on, and returns its length. If nothing is
+    /// missing any more, checks all and makes it the blob. No caller interrupts it.
     ///
     /// # Errors
     /// [`ObjectError::NoUpload`] when nothing has arrived; [`ObjectError::DigestMismatch`] when the bytes
     /// differ from the declaration; [`ObjectError::Busy`] when a stream writes the blob, or too many uploads
-    /// wait for their check; as [`BlobStore::begin_write`]. The client has to send the blob again.
+    /// wait for their check; as [`BlobStore::begin_write`]. The client has to send it again.
     pub async fn finish_write(
         self: &Arc<Self>,
         blob: &BlobRef,
         upload: &str,
+        offset: u64,
         limit_bytes: Option<u64>,
-    ) -> Result<(), ObjectError> {
+    ) -> Result<u64, ObjectError> {
         check_digest(&blob.digest)?;
         if check_digest(upload).is_err() || upload[..PREFIX] != blob.digest[..PREFIX] {
             return Err(ObjectError::NoUpload);
@@ -146,9 +166,7 @@ impl BlobStore {
         let (store, blob, upload) = (Arc::clone(self), blob.clone(), upload.to_owned());
         let finished = tokio::spawn(async move {
             let Place::Bucket(bucket) = &store.place else { return Err(ObjectError::NoUpload) };
-            let Some(turn) = store.finishes.turn().await else { return Err(ObjectError::Busy(blob.digest)) };
-            let adopted = store.adopt_sent(bucket, &blob, &upload, limit_bytes).await;
-            drop(turn);
+            let adopted = store.adopt_sent(bucket, &blob, &upload, offset, limit_bytes).await;
             // After other errors the object may still be needed. Its time ends anyway.
             if let Ok(_) | Err(ObjectError::DigestMismatch { .. }) = adopted {
                 let store = Arc::clone(&store);
@@ -163,56 +181,74 @@ impl BlobStore {
         finished.await.map_err(|_| ObjectError::Interrupted)?
     }
 
-    /// Makes what was sent the blob, unless the blob is there.
+    /// Makes what was sent a segment of the blob, or the blob, unless the blob is there.
     async fn adopt_sent(
         self: &Arc<Self>,
         bucket: &Arc<Bucket>,
         blob: &BlobRef,
         upload: &str,
+        offset: u64,
         limit_bytes: Option<u64>,
-    ) -> Result<(), ObjectError> {
+    ) -> Result<u64, ObjectError> {
         let sent = path_of(upload);
         let found = bucket.head(&sent).await?.ok_or(ObjectError::NoUpload)?;
-        if found.size != blob.bytes {
-            let message = format!("{} of {} bytes arrived", found.size, blob.bytes);
+        let end = offset.saturating_add(found.size);
+        if end > blob.bytes || found.size == 0 {
+            let message = format!("{} bytes arrived from byte {offset} of {} on", found.size, blob.bytes);
             return Err(ObjectError::DigestMismatch { digest: blob.digest.clone(), message });
         }
+        // Only the last part is followed by reading all of them.
+        let _turn = match end == blob.bytes {
+            true => Some(self.finishes.turn().await.ok_or_else(|| ObjectError::Busy(blob.digest.clone()))?),
+            false => None,
+        };
         let claim = WriteClaim::take(self, &blob.digest)?;
         let (arrived_bytes, is_complete) = self.committed(blob).await?;
         if is_complete {
-            return Ok(());
+            return Ok(found.size);
         }
-        if arrived_bytes > 0 {
-            // It would stay beside the copy, and nobody would count it.
+        if arrived_bytes != offset {
+            // It would stay beside what has arrived, and nobody would count it.
             let (digest, committed_bytes) = (blob.digest.clone(), arrived_bytes);
-            return Err(ObjectError::WrongOffset { digest, offset_bytes: 0, committed_bytes });
+            return Err(ObjectError::WrongOffset { digest, offset_bytes: offset, committed_bytes });
         }
-        let segment = segments::path_at(&blob.digest, 0);
+        let segment = segments::path_at(&blob.digest, offset);
         let copied = match bucket.store().copy(&sent, &segment).await {
             Err(object_store::Error::NotFound { .. }) => Err(ObjectError::NoUpload),
             copied => copied.map_err(ObjectError::Unavailable),
         };
         let replaced =
-            Replaced { upload: upload.to_owned(), bytes: blob.bytes, is_ours: self.is_signed(upload) };
+            Replaced { upload: upload.to_owned(), bytes: found.size, is_ours: self.is_signed(upload) };
         let admitted = match copied {
-            Ok(()) => self.admit(&claim, blob, blob.bytes, limit_bytes, Some(replaced)).await,
+            Ok(()) => self.admit(&claim, blob, end, limit_bytes, Some(replaced)).await,
             Err(error) => Err(error),
         };
-        if let Ok(true) = admitted {
-            return BlobWriter::open(claim, blob.clone(), blob.bytes).await?.finish().await;
+        match admitted {
+            Ok(true) if end == blob.bytes => {
+                BlobWriter::open(claim, blob.clone(), end).await?.finish().await?;
+            }
+            Ok(true) => {
+                claim.replace(None);
+                drop(self.take_signed(upload));
+                claim.settle().await;
+            }
+            admitted => {
+                // The copy may have been made although the bucket did not say so.
+                bucket.delete(vec![segment], |_| ()).await?;
+                // Another coordinator may have completed it.
+                claim.count(if let Ok(false) = admitted { 0 } else { offset });
+                claim.settle().await;
+                admitted?;
+            }
         }
-        // The copy may have been made although the bucket did not say so.
-        bucket.delete(vec![segment], |_| ()).await?;
-        claim.count(0);
-        claim.settle().await;
-        admitted.map(drop)
+        Ok(found.size)
     }
 
     /// The upload of a blob that a client has not finished; sending the blob here replaces it.
     pub(super) fn signed_for(&self, digest: &str) -> Option<Replaced> {
         let signed = self.signed.lock().unwrap_or_else(PoisonError::into_inner);
-        let (upload, found) = signed.iter().find(|(_, signed)| signed.blob.digest == digest)?;
-        Some(Replaced { upload: upload.clone(), bytes: found.blob.bytes, is_ours: true })
+        let (upload, found) = signed.iter().find(|(_, signed)| signed.digest == digest)?;
+        Some(Replaced { upload: upload.clone(), bytes: found.bytes, is_ours: true })
     }
 
     pub(super) fn is_signed(&self, upload: &str) -> bool {

@@ -22,12 +22,12 @@ fn folder(server: &S3Server, path: &str) -> PathBuf {
 }
 
 pub(super) async fn sent(write: &DirectWrite, content: &[u8]) -> Result<(), DirectError> {
-    let content = Content::Bytes(Bytes::copy_from_slice(content));
-    Direct::default().put(&write.request.url, &write.request.headers, content, BYTES as u64).await
+    let (range, content) = (0..content.len() as u64, Content::Bytes(Bytes::copy_from_slice(content)));
+    Direct::default().put(&write.request.url, &write.request.headers, &content, range).await
 }
 
 pub(super) async fn signed(store: &Arc<BlobStore>, blob: &BlobRef) -> DirectWrite {
-    store.sign_write(blob, None).await.unwrap().expect("S3 signs")
+    store.sign_write(blob, 0, None).await.unwrap().expect("S3 signs")
 }
 
 async fn got(url: &str, offset: u64, bytes: u64) -> Vec<u8> {
@@ -60,7 +60,7 @@ async fn a_client_fetches_a_blob_from_the_bucket() {
         let store = blobs.of(&Tenant::default()).await.unwrap();
         let blob = store.put(content.clone().into()).await.unwrap();
         assert_eq!(store.url_of(&blob.digest).await.unwrap(), None);
-        assert!(store.sign_write(&BlobRef::of(&[1; BYTES]), None).await.unwrap().is_none());
+        assert!(store.sign_write(&BlobRef::of(&[1; BYTES]), 0, None).await.unwrap().is_none());
     }
 }
 
@@ -74,7 +74,7 @@ async fn what_a_client_sends_is_hashed_before_it_is_a_blob() {
     assert_eq!(store.used_bytes().await.unwrap(), blob.bytes, "it counts from then on");
     sent(&write, &content).await.unwrap();
     assert!(!store.contains(&blob).await.unwrap(), "nobody has hashed it");
-    store.finish_write(&blob, &write.upload, None).await.unwrap();
+    store.finish_write(&blob, &write.upload, 0, None).await.unwrap();
     assert!(store.read(&blob).await.unwrap() == content);
     assert_eq!(store.used_bytes().await.unwrap(), blob.bytes, "it counts once");
     assert_eq!(object_count(&folder(&server, "uploads")), 0);
@@ -83,14 +83,14 @@ async fn what_a_client_sends_is_hashed_before_it_is_a_blob() {
     // The URL is still valid.
     sent(&write, &vec![7; BYTES]).await.unwrap();
     assert!(store.read(&blob).await.unwrap() == content, "a client has changed a blob");
-    store.finish_write(&blob, &write.upload, None).await.unwrap();
+    store.finish_write(&blob, &write.upload, 0, None).await.unwrap();
     assert!(store.read(&blob).await.unwrap() == content, "a client has changed a blob");
     until_empty(&folder(&server, "direct")).await;
 
     let other = BlobRef::of(&[8; BYTES]);
     let write = signed(&store, &other).await;
     sent(&write, &content).await.unwrap();
-    let refused = store.finish_write(&other, &write.upload, None).await.unwrap_err();
+    let refused = store.finish_write(&other, &write.upload, 0, None).await.unwrap_err();
     assert!(matches!(refused, ObjectError::DigestMismatch { .. }), "{refused}");
     assert!(!store.contains(&other).await.unwrap());
     let used = store.used_bytes().await.unwrap();
@@ -111,19 +111,19 @@ async fn a_client_sends_no_other_length_and_not_beyond_a_limit() {
         let refused = sent(&write, &vec![7; bytes]).await.unwrap_err();
         assert!(matches!(refused, DirectError::Refused(status) if status == 403), "{bytes} bytes: {refused}");
     }
-    let missing = store.finish_write(&blob, &write.upload, None).await.unwrap_err();
+    let missing = store.finish_write(&blob, &write.upload, 0, None).await.unwrap_err();
     assert!(matches!(missing, ObjectError::NoUpload), "{missing}");
     let of_other = signed(&store, &BlobRef::of(&[6; BYTES])).await.upload;
     assert_ne!(of_other[..2], blob.digest[..2]);
     for upload in ["", "../cas/00", &"0".repeat(64), &of_other] {
-        let missing = store.finish_write(&blob, upload, None).await.unwrap_err();
+        let missing = store.finish_write(&blob, upload, 0, None).await.unwrap_err();
         assert!(matches!(missing, ObjectError::NoUpload), "{upload}: {missing}");
     }
 
     // Those two count as long as their client can send them.
     let limit = Some(3 * blob.bytes + 1);
-    let first = store.sign_write(&blob, limit).await.unwrap().unwrap();
-    let refused = store.sign_write(&BlobRef::of(&[9; BYTES]), limit).await.err().expect("a second one");
+    let first = store.sign_write(&blob, 0, limit).await.unwrap().unwrap();
+    let refused = store.sign_write(&BlobRef::of(&[9; BYTES]), 0, limit).await.err().expect("a second one");
     assert!(matches!(refused, ObjectError::OverLimit { used_bytes: 900_000, .. }), "{refused}");
     // Sending it here counts instead of it, as long as it lasts.
     let through = store.begin_write(&blob, 0, limit).await.unwrap().unwrap();
@@ -131,14 +131,78 @@ async fn a_client_sends_no_other_length_and_not_beyond_a_limit() {
     through.pause().await.unwrap();
     assert_eq!(store.used_bytes().await.unwrap(), 3 * blob.bytes, "it counts no longer");
     sent(&first, &content).await.unwrap();
-    store.finish_write(&blob, &first.upload, limit).await.unwrap();
+    store.finish_write(&blob, &first.upload, 0, limit).await.unwrap();
 
-    for bytes in [1000, 300 << 20] {
-        let blob = BlobRef { bytes, ..blob.clone() };
-        assert!(!store.takes_directly(&blob, 0), "{bytes} bytes");
-        assert!(store.sign_write(&blob, None).await.unwrap().is_none(), "{bytes} bytes");
+    let long = at(&server).signed_by(|signing| Some(signing.writing_from(BYTES as u64)));
+    let long = TenantBlobs::open(long, dir.path(), 0, Clock::start(), None).await.unwrap();
+    let store = long.of(&Tenant::default()).await.unwrap();
+    assert!(store.takes_directly(&blob, 0) && !store.takes_directly(&blob, 5), "less is missing");
+    let short = BlobRef { bytes: blob.bytes - 1, ..blob };
+    assert!(!store.takes_directly(&short, 0));
+    assert!(store.sign_write(&short, 0, None).await.unwrap().is_none());
+}
+
+#[tokio::test]
+async fn a_long_blob_is_sent_in_parts_in_any_way() {
+    let (server, dir) = (S3Server::start(), tempfile::tempdir().unwrap());
+    const PART: u64 = 100_000;
+    let place = at(&server).signed_by(|signing| Some(signing.in_parts_of(PART)));
+    let blobs = TenantBlobs::open(place, dir.path(), 0, Clock::start(), None).await.unwrap();
+    let store = blobs.of(&"reef".parse().unwrap()).await.unwrap();
+    let content = content(BYTES + 5);
+    let blob = BlobRef::of(&content);
+    let used = async || store.used_bytes().await.unwrap();
+    let send = async |offset: u64| {
+        let write = store.sign_write(&blob, offset, Some(blob.bytes)).await.unwrap().unwrap();
+        assert_eq!(used().await, offset + write.bytes, "from byte {offset} on");
+        let (start, end) = (offset as usize, (offset + write.bytes) as usize);
+        sent(&write, &content[start..end]).await.unwrap();
+        write
+    };
+    assert!(store.takes_directly(&blob, 0) && !store.takes_at_once(&blob));
+    assert!(store.takes_at_once(&BlobRef { bytes: PART, ..blob.clone() }));
+    let refused = store.sign_write(&blob, 0, Some(blob.bytes - 1)).await.err().expect("over the limit");
+    let ObjectError::OverLimit { limit_bytes, .. } = refused else { panic!("{refused}") };
+    assert_eq!(limit_bytes, blob.bytes - 1);
+    // The second part does not go in before the first.
+    let first = send(0).await;
+    assert_eq!(first.bytes, PART);
+    let early = store.finish_write(&blob, &first.upload, PART, None).await.unwrap_err();
+    assert!(matches!(early, ObjectError::WrongOffset { committed_bytes: 0, .. }), "{early}");
+    assert_eq!(store.finish_write(&blob, &first.upload, 0, Some(blob.bytes)).await.unwrap(), PART);
+    assert_eq!(store.committed(&blob).await.unwrap(), (PART, false));
+    assert_eq!(used().await, PART, "what has arrived");
+    until_empty(&folder(&server, "direct")).await;
+    let again = store.finish_write(&blob, &first.upload, 0, None).await.unwrap_err();
+    assert!(matches!(again, ObjectError::NoUpload), "{again}");
+
+    // The second part goes through the coordinator, the third does not, and the last has five bytes.
+    let mut writer = store.begin_write(&blob, PART, Some(blob.bytes)).await.unwrap().unwrap();
+    writer.append(PART, Bytes::copy_from_slice(&content[PART as usize..2 * PART as usize])).await.unwrap();
+    writer.pause().await.unwrap();
+    let third = send(2 * PART).await;
+    store.finish_write(&blob, &third.upload, 2 * PART, Some(blob.bytes)).await.unwrap();
+    let last = send(3 * PART).await;
+    assert_eq!(store.finish_write(&blob, &last.upload, 3 * PART, Some(blob.bytes)).await.unwrap(), 5);
+    assert!(store.read(&blob).await.unwrap() == content);
+    assert_eq!(used().await, blob.bytes, "it counts once");
+    assert_eq!(object_count(&folder(&server, "uploads")), 0);
+
+    // Parts of other content are found out after the last one.
+    let other = BlobRef::of(&[8; 150_000]);
+    for (offset, bytes) in [(0, PART), (PART, 50_000)] {
+        let write = store.sign_write(&other, offset, None).await.unwrap().unwrap();
+        assert_eq!(write.bytes, bytes);
+        sent(&write, &vec![9; bytes as usize]).await.unwrap();
+        let finished = store.finish_write(&other, &write.upload, offset, None).await;
+        assert_eq!(finished.is_ok(), offset == 0, "{finished:?}");
     }
-    assert!(store.takes_directly(&blob, 0) && !store.takes_directly(&blob, 5), "a part has arrived");
+    assert!(!store.contains(&other).await.unwrap());
+    let write = store.sign_write(&other, PART, None).await.unwrap().unwrap();
+    sent(&write, &[8; 50_000]).await.unwrap();
+    let beyond = store.finish_write(&other, &write.upload, PART + 1, None).await.unwrap_err();
+    assert!(matches!(beyond, ObjectError::DigestMismatch { .. }), "{beyond}");
+    assert_eq!(object_count(&folder(&server, "uploads")), 0, "refused parts remain");
 }
 
 #[tokio::test]
@@ -150,11 +214,11 @@ async fn uploads_that_fit_are_finished_at_once_and_in_any_way() {
     let limit = Some(4 * BYTES as u64);
     let mut writes = Vec::new();
     for (blob, content) in blobs.iter().zip(&contents) {
-        let write = store.sign_write(blob, limit).await.unwrap().unwrap();
+        let write = store.sign_write(blob, 0, limit).await.unwrap().unwrap();
         sent(&write, content).await.unwrap();
         writes.push(write);
     }
-    let finish = |index: usize| store.finish_write(&blobs[index], &writes[index].upload, limit);
+    let finish = |index: usize| store.finish_write(&blobs[index], &writes[index].upload, 0, limit);
     let (first, second) = tokio::join!(finish(0), finish(1));
     first.unwrap();
     second.unwrap();
@@ -182,7 +246,7 @@ async fn a_part_that_has_arrived_stays_counted() {
     writer.pause().await.unwrap();
     let write = signed(&store, &blob).await;
     sent(&write, &[7; BYTES]).await.unwrap();
-    let refused = store.finish_write(&blob, &write.upload, None).await.unwrap_err();
+    let refused = store.finish_write(&blob, &write.upload, 0, None).await.unwrap_err();
     assert!(matches!(refused, ObjectError::WrongOffset { committed_bytes: 100_000, .. }), "{refused}");
     assert_eq!(store.used_bytes().await.unwrap(), 100_000 + blob.bytes);
     let mut writer = store.begin_write(&blob, 100_000, None).await.unwrap().unwrap();
@@ -215,7 +279,7 @@ async fn what_a_client_does_not_finish_is_deleted_in_time() {
         tokio::time::sleep(Duration::from_millis(50)).await;
     }
     assert_eq!(store.used_bytes().await.unwrap(), 0);
-    let missing = store.finish_write(&blob, &write.upload, None).await.unwrap_err();
+    let missing = store.finish_write(&blob, &write.upload, 0, None).await.unwrap_err();
     assert!(matches!(missing, ObjectError::NoUpload), "{missing}");
 }
 

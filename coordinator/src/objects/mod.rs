@@ -45,7 +45,7 @@ pub use error::ObjectError;
 pub use garbage::Removed;
 pub use place::ObjectsAt;
 use shared::SharedRows;
-pub use signing::{DIRECT_FROM_BYTES, SignedRequest, Signing};
+pub use signing::{DIRECT_READ_FROM_BYTES, SignedRequest, Signing};
 pub use tenants::TenantBlobs;
 pub use writer::BlobWriter;
 

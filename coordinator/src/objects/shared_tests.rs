@@ -4,7 +4,7 @@ use std::time::{Duration, SystemTime};
 
 use sqlx::{Connection as _, PgConnection};
 
-use super::bucket_tests::{at, content, key, objects, send};
+use super::bucket_tests::{at, content, key, object_count, objects, send};
 use super::direct_tests::{sent, signed, until_empty};
 use super::s3_server::{S3Server, age};
 use super::*;
@@ -34,6 +34,10 @@ impl Place {
     }
 
     async fn coordinator(&self) -> Coordinator {
+        self.coordinator_at(at(&self.server)).await
+    }
+
+    async fn coordinator_at(&self, place: ObjectsAt) -> Coordinator {
         let options = PostgresOptions {
             url: self.url.clone(),
             rules: Rules::default(),
@@ -44,8 +48,7 @@ impl Place {
         let database = PostgresStore::open(&options).await.unwrap();
         database.members().unwrap().meet(&[], 0, 600_000).await.unwrap();
         let ledger = database.ledger();
-        let blobs =
-            TenantBlobs::open(at(&self.server), self.dir.path(), 0, Clock::start(), ledger).await.unwrap();
+        let blobs = TenantBlobs::open(place, self.dir.path(), 0, Clock::start(), ledger).await.unwrap();
         Coordinator { blobs: blobs.of(&Tenant::default()).await.unwrap(), database }
     }
 
@@ -70,7 +73,7 @@ async fn what_one_coordinator_signs_another_finishes() {
     let write = signed(&one.blobs, &blob).await;
     assert_eq!(other.blobs.used_bytes().await.unwrap(), blob.bytes, "it counts from then on");
     sent(&write, &content).await.unwrap();
-    other.blobs.finish_write(&blob, &write.upload, None).await.unwrap();
+    other.blobs.finish_write(&blob, &write.upload, 0, None).await.unwrap();
     assert!(one.blobs.read(&blob).await.unwrap() == content);
     until_empty(&objects(&place.server, "direct")).await;
 
@@ -79,9 +82,9 @@ async fn what_one_coordinator_signs_another_finishes() {
     // A limit does not count it twice, wherever it is finished.
     let next = BlobRef::of(&[7; 300_000]);
     let limit = Some(2 * blob.bytes);
-    let write = one.blobs.sign_write(&next, limit).await.unwrap().unwrap();
+    let write = one.blobs.sign_write(&next, 0, limit).await.unwrap().unwrap();
     sent(&write, &[7; 300_000]).await.unwrap();
-    other.blobs.finish_write(&next, &write.upload, limit).await.unwrap();
+    other.blobs.finish_write(&next, &write.upload, 0, limit).await.unwrap();
     assert!(other.blobs.contains(&next).await.unwrap());
     assert_eq!(one.blobs.used_bytes().await.unwrap(), 2 * blob.bytes);
 
@@ -89,9 +92,31 @@ async fn what_one_coordinator_signs_another_finishes() {
     let wrong = BlobRef::of(&[8; 300_000]);
     let write = signed(&one.blobs, &wrong).await;
     sent(&write, &[9; 300_000]).await.unwrap();
-    let refused = other.blobs.finish_write(&wrong, &write.upload, None).await.unwrap_err();
+    let refused = other.blobs.finish_write(&wrong, &write.upload, 0, None).await.unwrap_err();
     assert!(matches!(refused, ObjectError::DigestMismatch { .. }), "{refused}");
     assert_eq!(one.blobs.used_bytes().await.unwrap(), 3 * blob.bytes);
+}
+
+#[tokio::test]
+async fn parts_are_finished_at_any_coordinator_and_counted_once() {
+    let Some(place) = Place::new() else { return };
+    let in_parts = || at(&place.server).signed_by(|signing| Some(signing.in_parts_of(100_000)));
+    let [one, other] = [place.coordinator_at(in_parts()).await, place.coordinator_at(in_parts()).await];
+    let content = content(250_000);
+    let blob = BlobRef::of(&content);
+    let limit = Some(blob.bytes);
+    for (offset, signer, finisher) in [(0, &one, &other), (100_000, &other, &other), (200_000, &one, &other)]
+    {
+        let write = signer.blobs.sign_write(&blob, offset, limit).await.unwrap().unwrap();
+        let used = finisher.blobs.used_bytes().await.unwrap();
+        assert_eq!(used, offset + write.bytes, "from byte {offset} on");
+        let range = offset as usize..(offset + write.bytes) as usize;
+        sent(&write, &content[range.clone()]).await.unwrap();
+        finisher.blobs.finish_write(&blob, &write.upload, offset, limit).await.unwrap();
+        assert_eq!(signer.blobs.used_bytes().await.unwrap(), range.end as u64, "after byte {}", range.end);
+    }
+    assert!(one.blobs.read(&blob).await.unwrap() == content);
+    assert_eq!(object_count(&objects(&place.server, "uploads")), 0);
 }
 
 #[tokio::test]
@@ -106,7 +131,7 @@ async fn many_direct_uploads_are_finished_at_once() {
         let write = signed(&both[number % 2].blobs, &blob).await;
         sent(&write, &content).await.unwrap();
         let blobs = Arc::clone(&both[number / 2 % 2].blobs);
-        finished.push(tokio::spawn(async move { blobs.finish_write(&blob, &write.upload, None).await }));
+        finished.push(tokio::spawn(async move { blobs.finish_write(&blob, &write.upload, 0, None).await }));
     }
     for finished in finished {
         finished.await.unwrap().unwrap();

@@ -16,8 +16,10 @@ use crate::rate_limited_log::RateLimitedLog;
 
 /// How long a URL is valid. A client whose token is revoked can use for this long what it got before.
 const VALID_FOR: Duration = Duration::from_secs(60);
-/// Shorter content is sent at once: the client would make a request more for it.
-pub const DIRECT_FROM_BYTES: u64 = 256 << 10;
+/// Shorter content is read through the coordinator: the client would make a request more for it.
+pub const DIRECT_READ_FROM_BYTES: u64 = 256 << 10;
+/// Most bytes of one upload: if its request breaks off, they have to be sent again.
+const PART_BYTES: u64 = 256 << 20;
 
 /// Signs URLs of the objects under a prefix of a bucket.
 #[derive(Clone)]
@@ -28,6 +30,9 @@ pub struct Signing {
     needs_tls: bool,
     /// Only S3 signs the length of what a client sends.
     s3: Option<Arc<AmazonS3>>,
+    /// What is shorter goes through the coordinator.
+    writes_from_bytes: u64,
+    part_bytes: u64,
     failures: Arc<RateLimitedLog>,
 }
 
@@ -49,7 +54,16 @@ impl fmt::Debug for Signing {
 impl Signing {
     /// For the objects under `prefix` of the bucket that `signer` signs for.
     pub fn new(signer: Arc<dyn Signer>, prefix: ObjectPath) -> Self {
-        Self { signer, prefix, needs_tls: false, s3: None, failures: Arc::default() }
+        let failures = Arc::default();
+        Self {
+            signer,
+            prefix,
+            needs_tls: false,
+            s3: None,
+            writes_from_bytes: 0,
+            part_bytes: PART_BYTES,
+            failures,
+        }
     }
 
     /// The same for S3, where uploads are signed too.
@@ -60,6 +74,17 @@ impl Signing {
     /// The same, which signs no URLs without TLS: a service that encrypts would send content in plain text.
     pub fn with_tls(self) -> Self {
         Self { needs_tls: true, ..self }
+    }
+
+    /// The same, which signs no uploads of less than `bytes`.
+    pub fn writing_from(self, bytes: u64) -> Self {
+        Self { writes_from_bytes: bytes, ..self }
+    }
+
+    /// The same, with other parts of uploads.
+    #[cfg(test)]
+    pub fn in_parts_of(self, bytes: u64) -> Self {
+        Self { part_bytes: bytes, ..self }
     }
 
     /// For the objects under a prefix of its own prefix.
@@ -92,9 +117,12 @@ impl Signing {
         })
     }
 
-    /// Whether [`Signing::to_write`] can succeed.
-    pub(super) fn signs_lengths(&self) -> bool {
-        self.s3.is_some()
+    /// Length of the next upload of a blob of `bytes` of which `arrived_bytes` have arrived; `None` if the
+    /// rest has to go through the coordinator.
+    pub(super) fn part(&self, bytes: u64, arrived_bytes: u64) -> Option<u64> {
+        let rest = bytes.saturating_sub(arrived_bytes);
+        let is_signed = self.s3.is_some() && rest >= self.writes_from_bytes.max(1);
+        is_signed.then(|| rest.min(self.part_bytes))
     }
 
     async fn signed(&self, method: Method, path: &ObjectPath) -> Option<Url> {

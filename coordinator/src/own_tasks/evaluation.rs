@@ -17,8 +17,6 @@ use crate::store::JobView;
 
 /// Longest evaluation that a task may submit, bytes: half a kB for each of some 100,000 held-out views.
 pub const MAX_EVALUATION_BYTES: u64 = 64 << 20;
-/// Most steps of each kind that are kept of a part; workers send no more.
-const MOST_STEPS: usize = 1 << 12;
 
 /// The held-out views of part `part` of `parts`, counted from 0, as positions in their list.
 pub fn views_of_part(part: usize, parts: usize, held_out: usize) -> Range<usize> {
@@ -100,7 +98,8 @@ impl Collected {
             if sums.views() != count {
                 return Err(differs("the borders", sums.views()));
             }
-            sums.thin(MOST_STEPS);
+            // Workers send no more, and may not make the coordinator keep more.
+            sums.thin();
             self.seam_sums.append(sums);
         }
         if let Some(sums) = parsed::<CoverSums>("sums of cover", &part.cover_sums_json)? {

@@ -15,7 +15,7 @@ use super::{datasets, encode};
 use crate::access::guard::caller;
 use crate::access::{Principal, Role};
 use crate::metrics::Metrics;
-use crate::objects::{BlobStore, BlobWriter, DIRECT_FROM_BYTES, ObjectError, SignedRequest};
+use crate::objects::{BlobStore, BlobWriter, DIRECT_READ_FROM_BYTES, ObjectError, SignedRequest};
 use crate::schedule::Tenant;
 use crate::service_error::ServiceError;
 use crate::state::{State, stopped};
@@ -61,15 +61,26 @@ impl Uploads {
     ) -> Result<v1::SignWriteResponse, ServiceError> {
         let blob = encode::required_blob("blob", request.blob)?;
         let place = self.place(caller, &request.job_id).await?;
-        if place.objects.contains(&blob).await? {
-            return Ok(v1::SignWriteResponse { complete: true, ..Default::default() });
+        let (committed_bytes, complete) = place.objects.committed(&blob).await?;
+        if complete {
+            return Ok(v1::SignWriteResponse { complete, ..Default::default() });
         }
-        let signed = place.objects.sign_write(&blob, place.limit_bytes).await;
+        let offset_bytes = request.offset_bytes;
+        if committed_bytes != offset_bytes {
+            // Before the client sends it in vain.
+            let digest = blob.digest;
+            return Err(ObjectError::WrongOffset { digest, offset_bytes, committed_bytes }.into());
+        }
+        if !request.in_parts && !place.objects.takes_at_once(&blob) {
+            return Ok(v1::SignWriteResponse::default());
+        }
+        let signed = place.objects.sign_write(&blob, offset_bytes, place.limit_bytes).await;
         let Some(signed) = signed.map_err(|error| place.fault(error))? else {
             return Ok(v1::SignWriteResponse::default());
         };
         let SignedRequest { url, headers } = signed.request;
-        Ok(v1::SignWriteResponse { complete: false, url, headers, upload: signed.upload })
+        let (upload, size_bytes) = (signed.upload, signed.bytes);
+        Ok(v1::SignWriteResponse { complete, url, headers, upload, size_bytes })
     }
 
     async fn finish(
@@ -79,9 +90,9 @@ impl Uploads {
     ) -> Result<v1::FinishWriteResponse, ServiceError> {
         let blob = encode::required_blob("blob", request.blob)?;
         let place = self.place(caller, &request.job_id).await?;
-        let finished = place.objects.finish_write(&blob, &request.upload, place.limit_bytes).await;
-        finished.map_err(|error| place.fault(error))?;
-        self.0.metrics.uploaded_directly(blob.bytes);
+        let v1::FinishWriteRequest { upload, offset_bytes, .. } = request;
+        let finished = place.objects.finish_write(&blob, &upload, offset_bytes, place.limit_bytes).await;
+        self.0.metrics.uploaded_directly(finished.map_err(|error| place.fault(error))?);
         Ok(v1::FinishWriteResponse {})
     }
 
@@ -171,7 +182,7 @@ impl Uploads {
             return Err(ServiceError::BadArgument { field: "offset_bytes", message });
         }
         if direct
-            && size_bytes - offset >= DIRECT_FROM_BYTES
+            && size_bytes - offset >= DIRECT_READ_FROM_BYTES
             && let Some(url) = objects.url_of(&digest).await?
         {
             metrics.served_directly(size_bytes - offset);

@@ -151,13 +151,16 @@ mod tests {
     fn a_sound_store_has_no_faults_and_each_fault_is_named() {
         assert_eq!(faults(&sound()), Vec::<String>::new());
         type Break = fn(&mut Export);
-        let broken: [(&str, Break); 16] = [
+        let broken: [(&str, Break); 17] = [
             ("4294967295 partitions, and has 1 tasks", |export| {
                 export.jobs[0].job.shape = JobShape {
                     partitions: u32::MAX,
                     stages: [Stage::Partition].into(),
                     ..JobShape::default()
                 }
+            }),
+            ("4294967295 evaluations, and has 1 tasks", |export| {
+                export.jobs[0].job.shape.evaluations = u32::MAX
             }),
             ("came from one request", |export| export.jobs[1].job.request_id = "request 0".into()),
             ("was granted twice", |export| export.jobs[1].tasks[0].fence = 1),

@@ -256,6 +256,10 @@ impl StepList {
 }
 
 impl SeamSums {
+    /// Most steps of each kind that a part of an evaluation keeps: their medians change little, and all parts
+    /// of a large scene fit the coordinator's memory.
+    const MOST_STEPS: usize = 1 << 12;
+
     /// Number of measured views.
     pub fn views(&self) -> usize {
         self.views.len()
@@ -272,9 +276,10 @@ impl SeamSums {
         }
     }
 
-    /// Keeps at most `most` steps of each kind, evenly spaced in the order of measuring: their medians change
-    /// little, and all parts of a large scene fit the coordinator's memory.
-    pub fn thin(&mut self, most: usize) {
+    /// Keeps at most 4096 steps of each kind, evenly spaced in the order of measuring. Their number stays
+    /// known.
+    pub fn thin(&mut self) {
+        let most = Self::MOST_STEPS;
         for StepList { steps, .. } in self.border_steps.iter_mut().chain(&mut self.control_steps) {
             let all = steps.len();
             if all > most {

@@ -15,6 +15,8 @@ pub mod faults;
 pub mod history;
 pub mod invariants;
 pub mod lines;
+#[path = "../../support/memory.rs"]
+mod memory;
 pub mod network;
 pub mod random;
 pub mod results;

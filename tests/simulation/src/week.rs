@@ -25,6 +25,7 @@ use fathom_core::scene::BlobRef;
 use fathom_invariants::{Fact, Record};
 use serde_json::Value;
 
+use crate::memory::resident_mib;
 use crate::random::Random;
 use crate::scene::blob_ref;
 
@@ -556,11 +557,4 @@ impl Week {
         let found = record.violations();
         self.played.violations.extend(found);
     }
-}
-
-/// Resident memory of this process.
-fn resident_mib() -> f64 {
-    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
-    let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:")).unwrap_or_default();
-    line.split_whitespace().next().and_then(|kib| kib.parse::<f64>().ok()).unwrap_or(0.0) / 1024.0
 }

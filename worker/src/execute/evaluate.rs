@@ -32,8 +32,6 @@ const FORMAT: u32 = 1;
 const BACKGROUND: [f32; 3] = [0.0; 3];
 /// Views that set the brightness of pictures of J, at half their size.
 const EXPOSED_VIEWS: usize = 64;
-/// Most steps across lines of each kind that a part of the evaluation keeps.
-const MOST_STEPS: usize = 1 << 12;
 /// Differences are amplified by this factor; a tenth of the 8-bit range is hard to see.
 const DIFFERENCE_GAIN: u8 = 4;
 
@@ -136,7 +134,7 @@ pub fn run(
     let (mut seams, cover) = (seams.map(SeamRun::sums), cover.sums());
     if is_part {
         if let Some(seams) = &mut seams {
-            seams.thin(MOST_STEPS);
+            seams.thin();
             evaluation.seam_sums_json = json("at borders", seams)?;
         }
         evaluation.cover_sums_json = json("of cover", &cover)?;

@@ -220,7 +220,8 @@ pub fn advance(
             }
         }
         let (before, started) = (run.progress().iteration, Instant::now());
-        let next = stretch.min(until_measured(before, eval_every)).min(span.until - before);
+        let until_first = cadence.until_first(before.saturating_sub(span.from), span.length());
+        let next = stretch.min(until_measured(before, eval_every)).min(until_first).min(span.until - before);
         let progress = run.advance(next)?;
         let took = started.elapsed().as_secs_f32().max(1e-6);
         let iterations_per_second = (progress.iteration - before) as f32 / took;
@@ -272,9 +273,21 @@ impl Cadence {
     }
 
     fn is_due(&self, iteration: u32, iterations: u32) -> bool {
-        let share = f64::from(iteration - self.started_at) / f64::from(iterations.max(1));
-        let early = !self.taken && share >= FIRST_CHECKPOINT_AT;
-        iteration < iterations && (early || self.last.elapsed() >= self.every)
+        let is_first = iteration >= self.first_at(iterations);
+        iteration < iterations && (is_first || self.last.elapsed() >= self.every)
+    }
+
+    /// Iterations from `iteration` to the first checkpoint; many after it. A fast GPU would otherwise end a
+    /// short task before anybody looks.
+    fn until_first(&self, iteration: u32, iterations: u32) -> u32 {
+        self.first_at(iterations).saturating_sub(iteration).max(1)
+    }
+
+    fn first_at(&self, iterations: u32) -> u32 {
+        if self.taken {
+            return u32::MAX;
+        }
+        self.started_at.saturating_add((f64::from(iterations) * FIRST_CHECKPOINT_AT).ceil() as u32)
     }
 
     fn taken(&mut self) {
@@ -332,8 +345,11 @@ mod tests {
         let mut cadence = Cadence::new(0, 3600);
         assert!(!cadence.is_due(99, 1000));
         assert!(cadence.is_due(100, 1000));
+        assert_eq!([0, 60, 99].map(|iteration| cadence.until_first(iteration, 1000)), [100, 40, 1]);
+        assert_eq!(Cadence::new(500, 3600).until_first(500, 1000), 100, "from a checkpoint on");
         cadence.taken();
         assert!(!cadence.is_due(900, 1000), "the second one is due by time");
+        assert!(cadence.until_first(900, 1000) > 1000);
         assert!(!Cadence::new(0, 0).is_due(1000, 1000), "at the end the result follows");
         assert!(Cadence::new(0, 0).is_due(1, 1000), "it is due by time");
     }
