@@ -183,6 +183,27 @@ async fn leases_end_by_the_clock_of_the_database() {
 }
 
 #[tokio::test]
+async fn a_sweep_that_waited_for_the_database_takes_nothing_back() {
+    let Some(url) = database() else { return };
+    let store = Arc::new(PostgresStore::open(&options_of(&url)).await.unwrap());
+    store.submit(new_job(1), 0).await.unwrap();
+    let lease = claim(store.as_ref(), &[Stage::Plan], 0).await.unwrap().lease;
+    // As if the machine was suspended in the middle of a call.
+    let mut holder = <::sqlx::PgConnection as ::sqlx::Connection>::connect(&url).await.unwrap();
+    ::sqlx::query("BEGIN").execute(&mut holder).await.unwrap();
+    ::sqlx::query("LOCK TABLE leases IN ACCESS EXCLUSIVE MODE").execute(&mut holder).await.unwrap();
+    let waits = tokio::spawn({
+        let store = Arc::clone(&store);
+        async move { store.sweep(0).await }
+    });
+    tokio::time::sleep(Duration::from_millis(LEASE_MS + 500)).await;
+    assert!(!waits.is_finished());
+    ::sqlx::query("COMMIT").execute(&mut holder).await.unwrap();
+    assert_eq!(waits.await.unwrap().unwrap(), [], "nobody could renew meanwhile");
+    assert_eq!(store.sweep(0).await.unwrap(), [(lease, Expired::Silent)], "a later one");
+}
+
+#[tokio::test]
 async fn a_store_moves_into_a_database_and_back_without_a_loss() {
     let (Some(first), Some(second)) = (database(), database()) else { return };
     let dir = tempfile::tempdir().unwrap();

@@ -259,9 +259,15 @@ impl JobStore for PostgresStore {
 
     async fn sweep(&self, now_ms: u64) -> Result<Vec<(Lease, Expired)>, StoreError> {
         let settings = &self.0.settings;
+        let begin = tokio::time::Instant::now();
         let overdue = on!(self.0, pool, |conn| leases::overdue(settings, conn, settings.given_ms(now_ms)))?;
         let mut taken_back = Vec::new();
         for lease in overdue {
+            // The database counts the time in which this call waited for it. If the whole machine was
+            // suspended, live workers could not renew in that time. The sweeper notices the pause.
+            if begin.elapsed() > Duration::from_millis(settings.lease_ms / 2) {
+                break;
+            }
             let change = Change::Expire(lease.clone());
             match self.0.change(&lease.job, None, change, now_ms).await {
                 Ok(Answer::Expired(why)) => taken_back.extend(why.map(|why| (lease, why))),
