@@ -9,7 +9,6 @@ use std::io::Write as _;
 use std::path::Path;
 
 use fathom_observe::{is_unseen, shown};
-use prost_types::Timestamp;
 use serde::Serialize;
 use serde_json::Value;
 
@@ -67,11 +66,6 @@ fn escaped_json(json: &str) -> String {
         }
     }
     text
-}
-
-/// A time in the format of all JSON of this program: seconds since 1970, with fractions.
-pub fn unix_seconds(time: &Option<Timestamp>) -> Option<f64> {
-    time.as_ref().map(|time| time.seconds as f64 + f64::from(time.nanos) * 1e-9)
 }
 
 /// "1 file", "2 files".

@@ -16,6 +16,7 @@ pub mod datasets;
 mod error;
 #[cfg(test)]
 mod fuzz;
+pub mod json;
 mod logs;
 pub mod maintenance;
 mod metrics;

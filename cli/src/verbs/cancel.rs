@@ -1,10 +1,11 @@
 //! `fathom cancel`: stops a job.
 
 use clap::Args;
+use fathom_coordinator::json;
 use fathom_proto::v1::JobState;
 
 use super::ServiceArgs;
-use super::show::{job_json, state_word};
+use super::show::state_word;
 use crate::error::Result;
 use crate::output;
 
@@ -28,7 +29,7 @@ pub async fn run(args: CancelArgs) -> Result<()> {
     let client = args.service.client().await?;
     let job = client.cancel(&args.job, &args.reason).await?;
     if args.json {
-        return output::json(&job_json(&job));
+        return output::json(&json::job(&job));
     }
     if job.state() == JobState::Cancelled {
         output::line(format!("job {}: {}", job.job_id, state_word(&job)));

@@ -3,8 +3,9 @@
 use std::path::PathBuf;
 
 use clap::{Args, Subcommand};
+use fathom_coordinator::json;
 use fathom_core::config::JobConfig;
-use fathom_proto::v1::{Dataset, DatasetState};
+use fathom_proto::v1::Dataset;
 use serde_json::{Value, json};
 
 use super::ServiceArgs;
@@ -85,7 +86,7 @@ pub async fn run(args: DatasetArgs) -> Result<()> {
             let client = args.service.client().await?;
             let datasets = client.datasets().await?;
             if args.json {
-                return output::json(&datasets.iter().map(dataset_json).collect::<Vec<_>>());
+                return output::json(&datasets.iter().map(json::dataset).collect::<Vec<_>>());
             }
             if datasets.is_empty() {
                 output::line(format!("no datasets at {}", client.url));
@@ -109,7 +110,7 @@ pub async fn run(args: DatasetArgs) -> Result<()> {
             };
             let list = list.as_ref().map(|list| String::from_utf8_lossy(list));
             if args.json {
-                let mut value = dataset_json(&dataset);
+                let mut value = json::dataset(&dataset);
                 if let Some(list) = list {
                     value["list"] = list.lines().map(file_json).collect::<Option<_>>().ok_or_else(|| {
                         let message = "the coordinator sent a list of files that cannot be read; use the \
@@ -149,25 +150,17 @@ async fn upload_scene(args: UploadArgs) -> Result<()> {
     let request_id = args.request_id.unwrap_or_else(|| uuid::Uuid::new_v4().to_string());
     let dataset = upload::upload_dataset(&client, &prepared, &args.id, &request_id).await?;
     if args.json {
-        return output::json(&dataset_json(&dataset));
+        return output::json(&json::dataset(&dataset));
     }
     output::line(&dataset.dataset_id);
     Ok(())
-}
-
-fn state_word(dataset: &Dataset) -> &'static str {
-    match dataset.state() {
-        DatasetState::Unspecified => "unknown",
-        DatasetState::Uploading => "uploading",
-        DatasetState::Committed => "committed",
-    }
 }
 
 fn dataset_line(dataset: &Dataset) -> String {
     format!(
         "{:<24} {:<9} {}, {}",
         dataset.dataset_id,
-        state_word(dataset),
+        json::dataset_state(dataset),
         output::count(dataset.files, "file"),
         output::bytes(dataset.size_bytes)
     )
@@ -178,19 +171,4 @@ fn file_json(line: &str) -> Option<Value> {
     let mut parts = line.splitn(3, ' ');
     let (digest, bytes, path) = (parts.next()?, parts.next()?.parse::<u64>().ok()?, parts.next()?);
     Some(json!({ "path": path, "digest": digest, "bytes": bytes }))
-}
-
-fn dataset_json(dataset: &Dataset) -> Value {
-    let seconds = output::unix_seconds;
-    json!({
-        "dataset": dataset.dataset_id,
-        "state": state_word(dataset),
-        "tenant": dataset.tenant,
-        "root_digest": dataset.root.as_ref().map(|root| &root.digest),
-        "files": dataset.files,
-        "bytes": dataset.size_bytes,
-        "created_unix_seconds": seconds(&dataset.create_time),
-        "committed_unix_seconds": seconds(&dataset.commit_time),
-        "ends_unix_seconds": seconds(&dataset.expire_time),
-    })
 }

@@ -6,10 +6,10 @@ use std::io::IsTerminal as _;
 use std::time::Duration;
 
 use clap::{Args, ValueEnum};
+use fathom_coordinator::json;
 use fathom_observe::shown;
 use fathom_proto::v1::{LogEntry, LogSeverity, StreamLogsRequest};
 use prost_types::Timestamp;
-use serde_json::{Value, json};
 
 use super::ServiceArgs;
 use crate::client::passing;
@@ -84,7 +84,7 @@ pub async fn run(args: LogsArgs) -> Result<()> {
                 Ok(Some(entry)) => {
                     (request.after_number, failures) = (entry.number, 0);
                     if args.json {
-                        output::json_line(&as_json(&entry));
+                        output::json_line(&json::log_line(&entry));
                     } else {
                         output::coloured(as_text(&entry, coloured));
                     }
@@ -112,29 +112,6 @@ pub async fn run(args: LogsArgs) -> Result<()> {
     }
 }
 
-fn word(severity: LogSeverity) -> &'static str {
-    match severity {
-        LogSeverity::Unspecified => "?",
-        LogSeverity::Trace => "trace",
-        LogSeverity::Debug => "debug",
-        LogSeverity::Info => "info",
-        LogSeverity::Warn => "warn",
-        LogSeverity::Error => "error",
-    }
-}
-
-fn as_json(entry: &LogEntry) -> Value {
-    json!({
-        "time": entry.time.as_ref().map(Timestamp::to_string),
-        "level": word(entry.severity()),
-        "task": entry.task_id,
-        "attempt": entry.attempt,
-        "worker": entry.worker,
-        "message": entry.message,
-        "number": entry.number,
-    })
-}
-
 fn as_text(entry: &LogEntry, coloured: bool) -> String {
     let time = entry.time.as_ref().map(Timestamp::to_string).unwrap_or_default();
     let severity = entry.severity();
@@ -143,7 +120,7 @@ fn as_text(entry: &LogEntry, coloured: bool) -> String {
         LogSeverity::Warn if coloured => ("\x1b[33m", "\x1b[0m"),
         _ => ("", ""),
     };
-    let level = word(severity);
+    let level = json::severity(severity);
     let (task_id, attempt, worker) = (shown(&entry.task_id), entry.attempt, shown(&entry.worker));
     // Later lines of a message are indented, so they do not look like log lines of their own.
     let message = entry.message.split('\n').map(shown).collect::<Vec<_>>().join("\n    ");
@@ -168,7 +145,7 @@ mod tests {
         let line = "2023-11-14T22:13:20.250Z warn  partition-0003 #2 reef-1: first\n    second\\u{1b}[2J";
         assert_eq!(as_text(&entry, false), line);
         assert!(as_text(&entry, true).contains("\x1b[33mwarn "));
-        let json = as_json(&entry);
+        let json = json::log_line(&entry);
         assert_eq!((json["number"].as_u64(), json["level"].as_str()), (Some(9), Some("warn")));
     }
 }

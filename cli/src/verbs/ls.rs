@@ -1,10 +1,11 @@
 //! `fathom ls`: the jobs of a service, newest first.
 
 use clap::{Args, ValueEnum};
+use fathom_coordinator::json;
 use fathom_proto::v1::{JobState, ListJobsRequest};
 
 use super::ServiceArgs;
-use super::show::{job_json, state_word};
+use super::show::state_word;
 use crate::error::Result;
 use crate::output;
 
@@ -64,7 +65,7 @@ pub async fn run(args: LsArgs) -> Result<()> {
     let mut jobs = client.list(filter, args.limit as usize).await?;
     jobs.truncate(args.limit as usize);
     if args.json {
-        return output::json(&jobs.iter().map(job_json).collect::<Vec<_>>());
+        return output::json(&jobs.iter().map(json::job).collect::<Vec<_>>());
     }
     if jobs.is_empty() {
         let which = if args.states.is_empty() && args.name.is_empty() && args.tenant.is_empty() {

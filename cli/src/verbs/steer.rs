@@ -1,11 +1,12 @@
 //! `fathom pause`, `resume`, `retry`, `update`, `delete`: control of an existing job.
 
 use clap::Args;
+use fathom_coordinator::json;
 use fathom_proto::v1::{Job, UpdateJobRequest};
 use serde_json::json;
 
 use super::ServiceArgs;
-use super::show::{job_json, state_word};
+use super::show::state_word;
 use crate::error::Result;
 use crate::output;
 
@@ -93,7 +94,7 @@ pub async fn delete(args: OneJob) -> Result<()> {
 /// "job J: resumed (partitions)".
 fn goes_on(job: &Job, json: bool, how: &str) -> Result<()> {
     if json {
-        return output::json(&job_json(job));
+        return output::json(&json::job(job));
     }
     output::line(format!("job {}: {how} ({})", job.job_id, state_word(job)));
     Ok(())
@@ -101,7 +102,7 @@ fn goes_on(job: &Job, json: bool, how: &str) -> Result<()> {
 
 fn print_job(job: &Job, json: bool, remark: &str) -> Result<()> {
     if json {
-        return output::json(&job_json(job));
+        return output::json(&json::job(job));
     }
     let remark = if remark.is_empty() { String::new() } else { format!(" ({remark})") };
     output::line(format!("job {}: {}{remark}", job.job_id, state_word(job)));

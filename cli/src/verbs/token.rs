@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use clap::{Args, Subcommand, ValueEnum};
 use fathom_coordinator::access;
+use fathom_coordinator::json;
 use fathom_coordinator::maintenance::{self, Place};
 use fathom_proto::admin::v1::{IssueTokenRequest, Role, Token};
 use prost_types::Timestamp;
@@ -248,8 +249,8 @@ fn token_json(token: &Token) -> Value {
         "name": token.name,
         "role": role_word(token),
         "tenant": (!token.tenant.is_empty()).then_some(&token.tenant),
-        "created_unix_seconds": output::unix_seconds(&token.create_time),
-        "expires_unix_seconds": output::unix_seconds(&token.expire_time),
-        "revoked_unix_seconds": output::unix_seconds(&token.revoke_time),
+        "created_unix_seconds": json::unix_seconds(&token.create_time),
+        "expires_unix_seconds": json::unix_seconds(&token.expire_time),
+        "revoked_unix_seconds": json::unix_seconds(&token.revoke_time),
     })
 }

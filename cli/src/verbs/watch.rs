@@ -6,13 +6,13 @@ use std::collections::BTreeMap;
 use std::time::{Duration, Instant, SystemTime};
 
 use clap::Args;
+use fathom_coordinator::json;
 use fathom_proto::v1::job_event::Event;
 use fathom_proto::v1::{HeldOutMetrics, Job, JobEvent, JobState, TaskState};
 use prost_types::Timestamp;
-use serde_json::{Value, json};
+use serde_json::json;
 
 use super::ServiceArgs;
-use super::show::{job_json, job_state_word, stage_word, task_word};
 use crate::client::Client;
 use crate::error::{CliError, Result};
 use crate::output;
@@ -35,7 +35,7 @@ pub async fn run(args: WatchArgs) -> Result<()> {
     let client = args.service.client().await?;
     let job = follow(&client, &args.job, args.json).await?;
     if args.json {
-        output::json_line(&job_json(&job));
+        output::json_line(&json::job(&job));
     } else {
         output::line(format!("job {} has succeeded", job.job_id));
     }
@@ -149,7 +149,7 @@ impl Watch<'_> {
             (_, None) => {}
             (Printer::Text(view), Some(event)) => view.show(event),
             (Printer::Json, Some(_)) => {
-                if let Some(value) = event_json(event) {
+                if let Some(value) = json::event(event) {
                     output::json_line(&value);
                 }
             }
@@ -228,12 +228,12 @@ impl View {
 
     fn show(&mut self, event: &Event) {
         match event {
-            Event::JobStage(stage) => self.progress.note(&stage_word(stage.stage())),
+            Event::JobStage(stage) => self.progress.note(&json::stage(stage.stage())),
             Event::TaskChanged(task) => {
                 if task.state() != TaskState::Leased {
                     self.tasks.remove(&task.task_id);
                 }
-                let mut line = format!("  {}: {}", task.task_id, task_word(task.state()));
+                let mut line = format!("  {}: {}", task.task_id, json::task_state(task.state()));
                 if task.attempt > 1 {
                     line += &format!(", attempt {}", task.attempt);
                 }
@@ -276,76 +276,5 @@ impl View {
         }
         let running = self.tasks.values().cloned().collect::<Vec<_>>().join("; ");
         self.progress.set((1000.0 * self.share) as u64, &running);
-    }
-}
-
-/// An event as JSON, in the words of `fathom show`; `None` for an event without information.
-fn event_json(event: &JobEvent) -> Option<Value> {
-    let mut value = match event.event.as_ref()? {
-        Event::JobState(change) => {
-            json!({"event": "job_state", "state": job_state_word(change.state()), "message": change.message})
-        }
-        Event::JobStage(change) => {
-            json!({"event": "job_stage", "stage": stage_word(change.stage()), "tasks": change.tasks})
-        }
-        Event::TaskChanged(task) => json!({
-            "event": "task",
-            "task": task.task_id,
-            "state": task_word(task.state()),
-            "attempt": task.attempt,
-            "worker": task.worker,
-            "message": task.message,
-            "resumed_from_iteration": task.resumed_from_iteration,
-        }),
-        Event::Progress(update) => json!({
-            "event": "progress",
-            "task": update.task_id,
-            "iteration": update.progress.map_or(0, |p| p.iteration),
-            "iterations": update.progress.map_or(0, |p| p.iterations),
-            "gaussians": update.progress.map_or(0, |p| p.gaussians),
-            "loss": update.progress.map(|p| p.loss),
-            "held_out": update.progress.and_then(|p| p.held_out).map(|m| json!({
-                "iteration": m.iteration, "psnr": m.psnr_db, "ssim": m.ssim, "views": m.views,
-            })),
-            "job_progress": update.job_progress,
-        }),
-        Event::Checkpoint(checkpoint) => json!({
-            "event": "checkpoint",
-            "task": checkpoint.task_id,
-            "attempt": checkpoint.attempt,
-            "iteration": checkpoint.iteration,
-        }),
-        Event::Warning(warning) => json!({"event": "warning", "message": warning.message}),
-        Event::Updated(now) => {
-            json!({"event": "updated", "priority": now.priority, "max_parallel": now.max_parallel})
-        }
-        Event::KeepAlive(_) => return None,
-    };
-    value["time"] = event.time.as_ref().map(Timestamp::to_string).into();
-    value["job"] = event.job_id.clone().into();
-    value["seq"] = event.seq.into();
-    Some(value)
-}
-
-#[cfg(test)]
-mod tests {
-    use fathom_proto::v1::JobStateChanged;
-
-    use super::*;
-
-    #[test]
-    fn an_event_has_time_and_job_in_the_words_of_show() {
-        let changed = JobStateChanged { state: JobState::Running.into(), message: String::new() };
-        let event = JobEvent {
-            job_id: "j".into(),
-            seq: 3,
-            time: Some(Timestamp { seconds: 1_700_000_000, nanos: 0 }),
-            event: Some(Event::JobState(changed)),
-        };
-        let value = event_json(&event).unwrap_or_default();
-        assert_eq!(
-            value,
-            json!({"event": "job_state", "state": "running", "message": "", "time": "2023-11-14T22:13:20Z", "job": "j", "seq": 3})
-        );
     }
 }

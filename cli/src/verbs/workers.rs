@@ -2,12 +2,11 @@
 //! tasks.
 
 use clap::{Args, Subcommand};
+use fathom_coordinator::json;
 use fathom_observe::shown;
-use fathom_proto::admin::v1::{Worker, WorkerState};
-use serde_json::{Value, json};
+use fathom_proto::admin::v1::Worker;
 
 use super::ServiceArgs;
-use super::show::stage_word;
 use crate::client::Client;
 use crate::error::{CliError, Result};
 use crate::output;
@@ -73,7 +72,7 @@ async fn list(args: ListArgs) -> Result<()> {
     let client = args.service.client().await?;
     let workers = client.workers().await?;
     if args.json {
-        return output::json(&workers.iter().map(worker_json).collect::<Vec<_>>());
+        return output::json(&workers.iter().map(json::worker).collect::<Vec<_>>());
     }
     if workers.is_empty() {
         output::line(format!("no workers at {}", client.url));
@@ -124,14 +123,14 @@ async fn id_of(client: &Client, given: &str) -> Result<String> {
 
 fn print(worker: &Worker, json: bool) -> Result<()> {
     if json {
-        return output::json(&worker_json(worker));
+        return output::json(&json::worker(worker));
     }
     output::line(worker_line(worker));
     Ok(())
 }
 
 fn worker_line(worker: &Worker) -> String {
-    let mut line = format!("{}  {:<9} {}", worker.worker_id, state_word(worker), worker.name);
+    let mut line = format!("{}  {:<9} {}", worker.worker_id, json::worker_state(worker), worker.name);
     if !worker.adapter.is_empty() {
         line += &format!(", {}", worker.adapter);
     }
@@ -145,38 +144,4 @@ fn worker_line(worker: &Worker) -> String {
         line += &format!(" ({})", worker.reason);
     }
     line
-}
-
-/// The state of a worker, in a word.
-fn state_word(worker: &Worker) -> &'static str {
-    match worker.state() {
-        _ if !worker.connected => "silent",
-        WorkerState::Unspecified => "unknown",
-        WorkerState::Active => "active",
-        WorkerState::Cordoned => "cordoned",
-        WorkerState::Draining => "draining",
-    }
-}
-
-fn worker_json(worker: &Worker) -> Value {
-    let held = worker.held.iter();
-    json!({
-        "worker": worker.worker_id,
-        "name": worker.name,
-        "state": state_word(worker),
-        "reason": (!worker.reason.is_empty()).then_some(&worker.reason),
-        "last_seen_unix_seconds": output::unix_seconds(&worker.last_seen),
-        "adapter": worker.adapter,
-        "memory_bytes": (worker.memory_bytes > 0).then_some(worker.memory_bytes),
-        "version": worker.build_version,
-        "stages": worker.stages().map(stage_word).collect::<Vec<_>>(),
-        "held": held
-            .map(|held| json!({
-                "job": held.job_id,
-                "task": held.task_id,
-                "attempt": held.attempt,
-                "since_unix_seconds": output::unix_seconds(&held.since),
-            }))
-            .collect::<Vec<_>>(),
-    })
 }
