@@ -1,5 +1,4 @@
-//! Jobs, events, workers, datasets and log lines as JSON, for `--json` of the command line and whatever else
-//! shows them.
+//! Jobs, events, workers, datasets and log lines as JSON: what `--json` of the command line prints.
 //!
 //! States are words, times are seconds since 1970 or RFC 3339, and a value that is not known is `null`.
 
@@ -48,7 +47,6 @@ pub fn task_state(state: TaskState) -> &'static str {
 
 /// A job as JSON, with words for states.
 pub fn job(of: &Job) -> Value {
-    let seconds = unix_seconds;
     json!({
         "job": of.job_id,
         "name": of.name,
@@ -61,12 +59,12 @@ pub fn job(of: &Job) -> Value {
         "partitions": of.partitions,
         "priority": of.priority,
         "max_parallel": of.max_parallel,
-        "created_unix_seconds": seconds(&of.create_time),
-        "ended_unix_seconds": seconds(&of.end_time),
+        "created_unix_seconds": unix_seconds(&of.create_time),
+        "ended_unix_seconds": unix_seconds(&of.end_time),
         "pause_reason": (!of.pause_reason.is_empty()).then_some(&of.pause_reason),
         "error": (!of.error.is_empty()).then_some(&of.error),
         "waiting_reason": (!of.waiting_reason.is_empty()).then_some(&of.waiting_reason),
-        "waiting_since_unix_seconds": seconds(&of.waiting_since),
+        "waiting_since_unix_seconds": unix_seconds(&of.waiting_since),
         "tasks": of.tasks.iter().map(task).collect::<Vec<_>>(),
     })
 }
@@ -195,7 +193,6 @@ pub fn dataset_state(dataset: &Dataset) -> &'static str {
 
 /// A dataset, without its files.
 pub fn dataset(of: &Dataset) -> Value {
-    let seconds = unix_seconds;
     json!({
         "dataset": of.dataset_id,
         "state": dataset_state(of),
@@ -203,9 +200,9 @@ pub fn dataset(of: &Dataset) -> Value {
         "root_digest": of.root.as_ref().map(|root| &root.digest),
         "files": of.files,
         "bytes": of.size_bytes,
-        "created_unix_seconds": seconds(&of.create_time),
-        "committed_unix_seconds": seconds(&of.commit_time),
-        "ends_unix_seconds": seconds(&of.expire_time),
+        "created_unix_seconds": unix_seconds(&of.create_time),
+        "committed_unix_seconds": unix_seconds(&of.commit_time),
+        "ends_unix_seconds": unix_seconds(&of.expire_time),
     })
 }
 
