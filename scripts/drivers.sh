@@ -37,6 +37,9 @@ declare -A ALLOWED=(
     [CURRENT-VALIDATION-ENABLED]="the layer's list of what is on"
     [VALIDATION-SETTINGS]="the layer's remark that GPU-assisted checks are slow beside the others"
     [WARNING-Setting-Limit-Adjusted]="the layer lowers a limit to make room for its own buffer"
+    [WARNING-cache-file-error]="the layer's cache of shaders, which is not there in the first run"
+    # NVIDIA's driver loads a function of video encoding like this, and not we.
+    [WARNING-vkGetDeviceProcAddr-device]="a driver asks the device for a function of the instance"
 )
 
 say() { printf 'drivers: %s\n' "$*" >&2; }

@@ -753,10 +753,17 @@ class Scene:
 
 
 def mean_distance_to_neighbours(points):
-    """Root mean square distance to the three nearest neighbours.
-
-    In parts, so that few distances exist at once.
-    """
+    """Root mean square distance to the three nearest neighbours."""
+    try:
+        from scipy.spatial import KDTree
+    except ImportError:
+        pass
+    else:
+        # gsplat asks a tree on the CPU too. Comparing a million points with each other takes minutes.
+        numbers = points.cpu().numpy()
+        distances, _ = KDTree(numbers).query(numbers, k=4, workers=-1)
+        return torch.from_numpy(np.sqrt((distances[:, 1:] ** 2).mean(axis=1))).to(points)
+    # In parts, so that few distances exist at once.
     rows = max(1, 50_000_000 // len(points))
     parts = []
     for start in range(0, len(points), rows):

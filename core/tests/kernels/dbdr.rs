@@ -14,7 +14,7 @@ use fathom_twins::{
 };
 
 use crate::device::{assert_same_bits, device, layouts, poison, storage};
-use crate::trainer::{BANDED, assert_same_model, config, photographs, same_however_it_runs};
+use crate::trainer::{assert_same_model, banded, config, photographs, same_however_it_runs};
 use crate::view::{Scene, View};
 use crate::water::{fixed, gradients_of, sunk, watery};
 
@@ -308,7 +308,7 @@ fn interruptions_short_lists_and_bands_change_no_byte() {
     let photographs = photographs(&gpu, 64, 48);
     let new = || watery(&photographs, config(30), by_pixel(DbdrMode::Maps));
     let learnt = |trainer: &mut Trainer| trainer.water_view().unwrap().unwrap();
-    let (_, water) = same_however_it_runs(&gpu, "maps", new, [0, 1, 13, 25], BANDED, learnt);
+    let (_, water) = same_however_it_runs(&gpu, "maps", new, [0, 1, 13, 25], banded(&gpu), learnt);
     let moved = water.refinement.unwrap().to_array();
     assert!(moved.iter().all(|value| *value != 0.0), "{moved:?}");
 }

@@ -8,12 +8,17 @@ use fathom_core::gpu::{Gpu, GpuOptions, TileLayout, device_for_test};
 /// Rubbish of two kinds: large numbers as u32, and as f32 a NaN and a large negative number.
 const RUBBISH: [u32; 2] = [0xDEAD_BEEF, 0x7FC0_1234];
 
-/// The device, by [`device_for_test`]; one for all tests of this process.
+/// The device, by [`device_for_test`]; one for all tests of this process. `FATHOM_TEST_LAYOUT=gpu` gives it
+/// the tiles of a GPU, whatever it is: some limits in tests depend on the size of tiles.
 pub fn device() -> Option<Arc<Gpu>> {
     static DEVICE: OnceLock<Option<Arc<Gpu>>> = OnceLock::new();
     DEVICE
         .get_or_init(|| {
-            let gpu = device_for_test("all kernels")?;
+            let mut gpu = device_for_test("all kernels")?;
+            if std::env::var_os("FATHOM_TEST_LAYOUT").is_some_and(|layout| layout == "gpu") {
+                let options = GpuOptions { allow_cpu: true, ..Default::default() };
+                gpu = Gpu::with_layout(options, TileLayout::GPU).unwrap();
+            }
             let adapter = gpu.adapter();
             note(&format!("kernels are tested on {} ({})", adapter.name, adapter.driver));
             Some(gpu)

@@ -11,7 +11,7 @@ use fathom_twins::{Exposure, ExposureState};
 
 use crate::device::{assert_same_bits, device, layouts, poison, storage};
 use crate::trainer::{
-    BANDED, assert_same_model, config, mean_psnr, photographs, photographs_from, run, same_however_it_runs,
+    assert_same_model, banded, config, mean_psnr, photographs, photographs_from, run, same_however_it_runs,
     truth,
 };
 
@@ -195,7 +195,7 @@ fn interruptions_short_lists_and_bands_change_no_byte() {
     let new = || run(&photographs, exposed(30));
     let learnt =
         |trainer: &mut Trainer| bytemuck::cast_slice::<_, u32>(&trainer.exposures().unwrap()).to_vec();
-    same_however_it_runs(&gpu, "exposures", new, [0, 1, 13], BANDED, learnt);
+    same_however_it_runs(&gpu, "exposures", new, [0, 1, 13], banded(&gpu), learnt);
 }
 
 #[test]

@@ -63,10 +63,11 @@ fn a_factor_on_the_loss_changes_almost_nothing_under_adam() {
         (water.priors.dark_channel, water.priors.depth_smoothness) = (1.0, 2.0);
         Some(MediumRun { is_free: false, ..fixed(&water, 3.2) })
     };
-    // A power of two preserves every mantissa. Any other factor changes the rounding of the gradients. Where
-    // the water acts on pixels, gradients are divided by alphas that may be small, which amplifies rounding.
+    // A power of two preserves every mantissa. Any other factor changes the rounding of the gradients, by an
+    // amount that depends on the size of tiles. Where the water acts on pixels, gradients are divided by
+    // alphas that may be small, which amplifies rounding.
     for (medium, rounded) in
-        [(None, 1e-2), (water(Medium::PerGaussian), 1e-2), (water(Medium::PerPixel), 5e-2)]
+        [(None, 3e-2), (water(Medium::PerGaussian), 3e-2), (water(Medium::PerPixel), 5e-2)]
     {
         let trained = |config: TrainConfig| trained(&gpu, &config, &views, medium.clone());
         let plain = trained(config(1.0));

@@ -11,7 +11,7 @@ use fathom_core::water::WaterRecord;
 use fathom_twins::{Blended, WaterState, form_backward};
 
 use crate::device::{assert_same_bits, device, layouts, storage};
-use crate::trainer::{BANDED, assert_same_model, config, photographs, same_however_it_runs};
+use crate::trainer::{assert_same_model, banded, config, photographs, same_however_it_runs};
 use crate::water::{WATER, gradients_of, medium_run, watery, with};
 
 const PER_GAUSSIAN: (Medium, Blend) = (Medium::PerGaussian, Blend::Srgb);
@@ -84,7 +84,7 @@ fn timing_interruptions_lists_and_bands_change_no_byte() {
         let what = format!("{composed:?}, every {}", network.every);
         // Every iteration of two cadences, with pending predictions, and across the end of the network's
         // part.
-        same_however_it_runs(&gpu, &what, new, 3..13, BANDED, learnt);
+        same_however_it_runs(&gpu, &what, new, 3..13, banded(&gpu), learnt);
     }
 }
 

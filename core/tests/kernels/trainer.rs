@@ -174,8 +174,10 @@ pub fn same_however_it_runs<T: PartialEq>(
     (model, expected)
 }
 
-/// Lists so short that a view of [`photographs`] needs several bands.
-pub const BANDED: ListLimits = ListLimits { visible: 70, intersections: 400 };
+/// Lists so short that a view of [`photographs`] needs several bands, and long enough for a tile.
+pub fn banded(gpu: &Gpu) -> ListLimits {
+    ListLimits { visible: if gpu.layout().tile > 8 { 90 } else { 70 }, intersections: 400 }
+}
 
 #[track_caller]
 pub fn assert_same_model(what: &str, left: &Gaussians, right: &Gaussians) {
@@ -405,7 +407,7 @@ fn short_lists_grow_and_change_no_byte() {
             (trainer.gaussians().unwrap(), loss, trainer.list_capacities())
         };
         let (ample, loss, _) = train(None);
-        for capacities in [(1, 1), (20, 5000), (100, 300)] {
+        for capacities in [(1, 1), (20, 5000), (50, 150)] {
             let (model, short_loss, grown) = train(Some(capacities));
             assert!(grown.0 > capacities.0 || grown.1 > capacities.1, "{capacities:?} must be too short");
             assert_same_model(&format!("{:?}, lists of {capacities:?}", config.strategy), &ample, &model);

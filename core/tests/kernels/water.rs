@@ -26,7 +26,7 @@ use fathom_twins::{
 use glam::DVec3;
 
 use crate::device::{device, layouts, poison, storage};
-use crate::trainer::{BANDED, config, photographs, run, same_however_it_runs, truth};
+use crate::trainer::{banded, config, photographs, run, same_however_it_runs, truth};
 use crate::view::{ImageGradients, Scene, View, gradients_only};
 
 pub const WATER: Water =
@@ -449,7 +449,7 @@ fn interruptions_short_lists_and_bands_change_no_byte() {
     for water in COMPOSITIONS.map(with).into_iter().chain([all_terms, WaterConfig::paper()]) {
         let new = || watery(&photographs, config(30), water.clone());
         let learnt = |trainer: &mut Trainer| trainer.water().unwrap().unwrap().to_array().map(f64::to_bits);
-        same_however_it_runs(&gpu, &format!("{water:?}"), new, [0, 1, 13, 25], BANDED, learnt);
+        same_however_it_runs(&gpu, &format!("{water:?}"), new, [0, 1, 13, 25], banded(&gpu), learnt);
     }
 }
 
