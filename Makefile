@@ -3,7 +3,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .ONESHELL:
 .DEFAULT_GOAL := help
-.PHONY: help setup build demo test check settings drivers traces fuzz simulate soak bench accept ablation dist release-protos
+.PHONY: help setup build demo test check settings drivers traces fuzz simulate soak bench accept ablation dist release-protos web
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /  make \1	/' | expand -t 20
@@ -20,7 +20,9 @@ demo: build ## trains a synthetic wreck with two workers in 2x2 partitions, with
 test: ## every test; those that need a GPU run on Mesa's CPU driver, those of a database on a PostgreSQL that is installed
 	@scripts/setup.sh --for-tests
 	scripts/drivers.sh fetch || true
+	scripts/web.sh check || [ $$? -eq 3 ]
 	cargo test --workspace
+	scripts/web.sh headless quick || [ $$? -eq 3 ]
 
 check: ## formatting, lints, scripts, documentation, shaders, protos, tidiness; CI runs this before the tests
 	@cargo fmt --all --check
@@ -29,6 +31,9 @@ check: ## formatting, lints, scripts, documentation, shaders, protos, tidiness; 
 	cargo clippy --workspace --all-targets -- -D warnings
 	RUSTDOCFLAGS="-D warnings" cargo doc --workspace --no-deps
 	cargo test --workspace --test shaders_validate --test languages --test compatible --test tidy
+
+web: ## builds the pages for browsers (web/dist) from web/src; needs npm and its registry
+	@scripts/web.sh build
 
 settings: ## docs/using/settings.md and the example files in deploy/, from the settings in the source
 	@FATHOM_WRITE_SETTINGS=1 cargo test --workspace --bin fathom settings_page_and_example_files_are_current
@@ -51,6 +56,7 @@ soak: build ## random kills of real processes during FATHOM_KILLS_ROUNDS=40 jobs
 	FATHOM_KILLS_STORE=postgres cargo test --workspace --test kills
 	cargo test --workspace --test week -- --ignored --nocapture
 	cargo test --workspace --test cluster memory:: -- --ignored --nocapture --test-threads=1
+	scripts/web.sh headless
 	cargo test -p fathom-coordinator --test power_cuts -- --ignored --nocapture
 
 bench: build ## times of the trainer on this machine, compared with BASELINE=<commit>

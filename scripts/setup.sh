@@ -2,8 +2,8 @@
 # Prepares a machine to build and run Fathom: Rust is required, everything else is installed here.
 #
 # Installs only a Vulkan loader and Mesa's drivers (which include lavapipe, the CPU driver), and only if no
-# Vulkan driver is found. With --for-tests, also PostgreSQL, whose server the tests start and stop themselves.
-# Otherwise does nothing.
+# Vulkan driver is found. With --for-tests, also PostgreSQL, whose server the tests start and stop themselves,
+# and Chromium and npm for the pages. Otherwise does nothing.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -49,6 +49,13 @@ fi
 # Without apt-get, tests of a database are skipped.
 if [ "${1:-}" = --for-tests ] && ! have_postgres && command -v apt-get >/dev/null; then
     packages+=(postgresql)
+fi
+
+# The same of the pages.
+if [ "${1:-}" = --for-tests ] && command -v apt-get >/dev/null; then
+    [ -n "${CHROMIUM:-}" ] || command -v chromium-headless-shell chromium google-chrome >/dev/null \
+        || packages+=(chromium-headless-shell)
+    command -v npm >/dev/null || packages+=(npm)
 fi
 
 if [ "${#packages[@]}" -gt 0 ]; then

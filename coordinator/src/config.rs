@@ -35,6 +35,9 @@ pub struct CoordinatorConfig {
     /// Where to serve metrics and health over HTTP, neither encrypted nor authenticated; port 0 takes a free
     /// one. Default: nowhere.
     pub metrics_listen: Option<SocketAddr>,
+    /// Where to serve the HTTP interface, with the TLS and the tokens of this coordinator, which it needs
+    /// beyond this machine; port 0 takes a free one. Default: nowhere.
+    pub web: Option<SocketAddr>,
     /// Where to serve KEDA, which starts workers by the number of tasks; port 0 takes a free one. Beyond this
     /// machine it needs `tls_cert`, `tls_key` and `scaler_client_ca`. Default: nowhere.
     pub scaler_listen: Option<SocketAddr>,
@@ -110,6 +113,7 @@ impl Default for CoordinatorConfig {
             direct_uploads_from_bytes: 8 << 20,
             listen: SocketAddr::from((Ipv4Addr::LOCALHOST, 7420)),
             metrics_listen: None,
+            web: None,
             scaler_listen: None,
             scaler_client_ca: None,
             lease_ms: 60_000,
@@ -147,18 +151,21 @@ impl CoordinatorConfig {
                 faults.push(fault.to_owned());
             }
         };
-        require(
-            self.metrics_listen.is_none_or(|listen| listen.port() == 0 || listen != self.listen),
-            "metrics_listen must differ from listen",
-        );
-        let takes = |other: Option<SocketAddr>, listen: SocketAddr| {
-            other.is_some_and(|other| other.port() != 0 && other == listen)
-        };
-        require(
-            !takes(self.scaler_listen, self.listen)
-                && !self.metrics_listen.is_some_and(|metrics| takes(self.scaler_listen, metrics)),
-            "scaler_listen must differ from listen and metrics_listen",
-        );
+        let others = [
+            ("metrics_listen", self.metrics_listen),
+            ("scaler_listen", self.scaler_listen),
+            ("web", self.web),
+        ];
+        let mut taken = vec![("listen", self.listen)];
+        for (name, address) in others.into_iter().filter_map(|(name, of)| Some((name, of?))) {
+            // Port 0 takes another port for each.
+            let same = taken.iter().find(|(_, other)| address.port() != 0 && *other == address);
+            require(
+                same.is_none(),
+                &format!("{name} must differ from {}", same.map_or("", |(name, _)| name)),
+            );
+            taken.push((name, address));
+        }
         require(
             self.scaler_client_ca.is_none() || (self.tls_cert.is_some() && self.scaler_listen.is_some()),
             "scaler_client_ca needs scaler_listen, tls_cert and tls_key: certificates are sent over TLS only",
@@ -207,6 +214,11 @@ impl CoordinatorConfig {
         require(
             is_safe || self.insecure || self.listen.ip().is_loopback(),
             "listen is reachable from other machines, and anyone could read and control everything: set tls_cert, tls_key and \
+             tokens = true, or insecure = true",
+        );
+        require(
+            is_safe || self.insecure || self.web.is_none_or(|web| web.ip().is_loopback()),
+            "web is reachable from other machines, and anyone could read and control everything: set tls_cert, tls_key and \
              tokens = true, or insecure = true",
         );
         require(
@@ -297,6 +309,21 @@ mod tests {
         assert!(said.len() == 1 && said[0].contains("needs scaler_listen"), "{said:?}");
         let said = faults(|config| config.scaler_listen = Some(config.listen));
         assert!(said.len() == 1 && said[0].contains("must differ"), "{said:?}");
+    }
+
+    #[test]
+    fn the_http_interface_needs_an_address_of_its_own() {
+        let said = faults(|config| config.web = Some(config.listen));
+        assert_eq!(said, ["web must differ from listen"]);
+        let free = SocketAddr::from((Ipv4Addr::LOCALHOST, 0));
+        let on_free = |config: &mut CoordinatorConfig| {
+            (config.listen, config.web, config.metrics_listen) = (free, Some(free), Some(free));
+        };
+        assert_eq!(faults(on_free), Vec::<String>::new());
+        let everywhere = Some(SocketAddr::from((Ipv4Addr::UNSPECIFIED, 7480)));
+        let said = faults(|config| config.web = everywhere);
+        assert!(said.len() == 1 && said[0].contains("insecure = true"), "{said:?}");
+        assert_eq!(faults(|config| (config.web, config.insecure) = (everywhere, true)).len(), 0);
     }
 
     #[test]

@@ -1,8 +1,9 @@
-//! Jobs, events, workers, datasets and log lines as JSON: what `--json` of the command line prints.
+//! Jobs, events, workers, tenants, datasets and log lines as JSON: what `--json` of the command line prints,
+//! and what the HTTP interface answers.
 //!
 //! States are words, times are seconds since 1970 or RFC 3339, and a value that is not known is `null`.
 
-use fathom_proto::admin::v1::{Worker, WorkerState};
+use fathom_proto::admin::v1::{Tenant, Worker, WorkerState};
 use fathom_proto::v1::job_event::Event;
 use fathom_proto::v1::{
     Dataset, DatasetState, Job, JobEvent, JobState, LogEntry, LogSeverity, Stage, Task, TaskState,
@@ -179,6 +180,22 @@ pub fn worker(of: &Worker) -> Value {
                 "since_unix_seconds": unix_seconds(&held.since),
             }))
             .collect::<Vec<_>>(),
+    })
+}
+
+/// A tenant with its usage and its limits; `null` for no limit.
+pub fn tenant(of: &Tenant) -> Value {
+    let quota = of.quota.unwrap_or_default();
+    let limit = |most: u64| (most > 0).then_some(most);
+    json!({
+        "tenant": of.name,
+        "open_jobs": of.open_jobs,
+        "leased_tasks": of.leased_tasks,
+        "bytes": of.bytes,
+        "max_open_jobs": limit(quota.max_open_jobs.into()),
+        "max_parallel": limit(quota.max_parallel.into()),
+        "max_bytes": limit(quota.max_bytes),
+        "own_limits": of.quota_is_own,
     })
 }
 

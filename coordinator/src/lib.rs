@@ -35,6 +35,7 @@ pub mod store;
 mod sweep;
 mod tls;
 mod wakeups;
+mod web;
 mod worker_registry;
 
 pub use clock::Clock;

@@ -17,8 +17,10 @@ use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::TcpListener;
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
+use tonic::service::Routes;
 use tonic::transport::Server;
 use tonic::transport::server::Connected;
+use tower_layer::Layer;
 
 use crate::access::calls::OpenCalls;
 use crate::access::guard::{Guard, GuardLayer};
@@ -45,18 +47,19 @@ use crate::store::{Hold, PostgresOptions, PostgresStore, SledOptions, SledStore,
 use crate::sweep::sweep_leases;
 use crate::tls::Tls;
 use crate::wakeups::Wakeups;
+use crate::web;
 use crate::worker_registry::WorkerRegistry;
 
 /// A half-open connection is detected after the sum of these; without keep-alives its streams would hang for
 /// hours.
-const KEEPALIVE_EVERY: Duration = Duration::from_secs(20);
-const KEEPALIVE_TIMEOUT: Duration = Duration::from_secs(10);
+pub const KEEPALIVE_EVERY: Duration = Duration::from_secs(20);
+pub const KEEPALIVE_TIMEOUT: Duration = Duration::from_secs(10);
 /// Largest accepted message, with margin.
 const MAX_MESSAGE_BYTES: usize = 4 << 20;
 /// The same of uploads: ten thousand files with the longest paths that may be, or a piece of a blob.
 pub const MAX_UPLOAD_MESSAGE_BYTES: usize = 12 << 20;
 /// Maximum open calls of a connection; one more waits at the client.
-const MAX_CALLS_OF_A_CONNECTION: u32 = 1024;
+pub const MAX_CALLS_OF_A_CONNECTION: u32 = 1024;
 /// Time that open calls have to end when the coordinator stops.
 const STOP_WITHIN: Duration = Duration::from_secs(5);
 
@@ -65,6 +68,7 @@ pub struct Coordinator {
     address: SocketAddr,
     scheme: &'static str,
     metrics_address: Option<SocketAddr>,
+    web_address: Option<SocketAddr>,
     scaler_address: Option<SocketAddr>,
     stopping: watch::Sender<bool>,
     running: JoinHandle<Result<(), CoordinatorError>>,
@@ -85,6 +89,11 @@ impl Coordinator {
     /// The address of metrics and health, if served.
     pub fn metrics_address(&self) -> Option<SocketAddr> {
         self.metrics_address
+    }
+
+    /// The address of the HTTP interface, if served.
+    pub fn web_address(&self) -> Option<SocketAddr> {
+        self.web_address
     }
 
     /// The address of the scaler, if served.
@@ -153,6 +162,10 @@ pub async fn serve(config: CoordinatorConfig) -> Result<Coordinator, Coordinator
         Some(address) => Some(listen(address).await?),
         None => None,
     };
+    let for_web = match config.web {
+        Some(address) => Some((listen(address).await?, Tls::of_web(&config)?)),
+        None => None,
+    };
     let for_scaler = match config.scaler_listen {
         Some(address) => Some((listen(address).await?, Tls::of_scaler(&config)?)),
         None => None,
@@ -169,8 +182,9 @@ pub async fn serve(config: CoordinatorConfig) -> Result<Coordinator, Coordinator
         TenantBlobs::open(at, &config.data_dir, config.min_free_bytes, clock, store.ledger()).await?;
     let house = config.housekeeping();
     let room = Room::of_this_process();
+    let incoming = accepted(listener);
     let mut coordinator =
-        start(config, tls, objects, store, clock, house, for_metrics, room, accepted(listener)).await?;
+        start(config, tls, objects, store, clock, house, for_metrics, for_web, room, incoming).await?;
     if let Some(((listener, address), tls)) = for_scaler {
         tracing::info!(%address, with_certificates = tls.is_some(), "serving KEDA");
         coordinator.scaler_address = Some(address);
@@ -227,7 +241,7 @@ where
     let objects = TenantBlobs::open(at, &config.data_dir, config.min_free_bytes, clock, None).await?;
     let incoming = incoming.filter_map(|accepted| std::future::ready(accepted.ok().map(|io| (io, None))));
     let room = Room::of_descriptors(None);
-    start(config, tls, objects, Arc::new(store), clock, house, None, room, incoming).await
+    start(config, tls, objects, Arc::new(store), clock, house, None, None, room, incoming).await
 }
 
 /// TLS where the configuration has it, once the configuration is found to be free of contradictions.
@@ -246,7 +260,8 @@ async fn start<I, C>(
     store: Arc<dyn Store>,
     clock: Clock,
     house: Housekeeping,
-    for_metrics: Option<(TcpListener, SocketAddr)>,
+    for_metrics: Option<Bound>,
+    for_web: Option<(Bound, Option<Arc<Tls>>)>,
     room: Room,
     incoming: I,
 ) -> Result<Coordinator, CoordinatorError>
@@ -257,6 +272,7 @@ where
     let address = config.listen;
     let scheme = if tls.is_some() { "https" } else { "http" };
     let metrics_address = for_metrics.as_ref().map(|(_, address)| *address);
+    let web_address = for_web.as_ref().map(|((_, address), _)| *address);
     store.recover(clock.now_ms()).await?;
     for (_, objects) in objects.all().await? {
         objects.discard_staged()?;
@@ -332,24 +348,69 @@ where
         tokio::spawn(keep_in_touch(Arc::clone(&shared), members, Arc::clone(&connections)));
     }
     let guard = GuardLayer(Arc::new(guard));
+    let web = for_web.map(|((listener, address), tls)| {
+        tracing::info!(%address, with_tls = tls.is_some(), "serving the HTTP interface");
+        let shared = Arc::clone(&shared);
+        serve_web(shared, guard.clone(), tls, Arc::clone(&connections).of(accepted(listener)))
+    });
     let incoming = connections.of(incoming);
     let running = match tls {
-        None => tokio::spawn(run(Arc::clone(&shared), house.every, incoming, guard)),
+        None => tokio::spawn(run(Arc::clone(&shared), house.every, incoming, guard, web)),
         Some(tls) => {
-            let (watched, mut ends) = (Arc::clone(&tls), shared.stopping.clone());
-            tokio::spawn(async move {
-                tokio::select! {
-                    () = stopped(&mut ends) => {}
-                    () = watched.watch() => {}
-                }
-            });
-            tokio::spawn(run(Arc::clone(&shared), house.every, tls.over(incoming), guard))
+            keep_fresh(&tls, &shared);
+            tokio::spawn(run(Arc::clone(&shared), house.every, tls.over(incoming), guard, web))
         }
     };
-    Ok(Coordinator { address, metrics_address, scaler_address: None, scheme, stopping, running, shared })
+    let scaler_address = None;
+    Ok(Coordinator {
+        address,
+        metrics_address,
+        web_address,
+        scaler_address,
+        scheme,
+        stopping,
+        running,
+        shared,
+    })
 }
 
-async fn listen(listen: SocketAddr) -> Result<(TcpListener, SocketAddr), CoordinatorError> {
+/// Checks the files of TLS until the coordinator stops.
+fn keep_fresh(tls: &Arc<Tls>, shared: &State) {
+    let (watched, mut ends) = (Arc::clone(tls), shared.stopping.clone());
+    tokio::spawn(async move {
+        tokio::select! {
+            () = stopped(&mut ends) => {}
+            () = watched.watch() => {}
+        }
+    });
+}
+
+/// Serves the HTTP interface until the coordinator stops.
+async fn serve_web<I, C>(shared: Arc<State>, guard: GuardLayer, tls: Option<Arc<Tls>>, incoming: I)
+where
+    I: Stream<Item = io::Result<C>> + Send + 'static,
+    C: AsyncRead + AsyncWrite + Connected + Unpin + Send + 'static,
+{
+    let door = RpcLayer(Arc::clone(&shared.metrics)).layer(guard.layer(user_services(&shared)));
+    let (access, clock) = (Arc::clone(&shared.access), shared.clock);
+    let mut stopping = shared.stopping.clone();
+    let stops = async move { stopped(&mut stopping).await };
+    let served = match tls {
+        None => web::serve(incoming, door, access, clock, stops).await,
+        Some(tls) => {
+            keep_fresh(&tls, &shared);
+            web::serve(tls.over(incoming), door, access, clock, stops).await
+        }
+    };
+    if let Err(error) = served {
+        tracing::error!(%error, "the HTTP interface ended; it is back when the coordinator starts again");
+    }
+}
+
+/// A listener and its address, with the port that it got.
+type Bound = (TcpListener, SocketAddr);
+
+async fn listen(listen: SocketAddr) -> Result<Bound, CoordinatorError> {
     let failed = |source| CoordinatorError::Listen { listen, source };
     let listener = TcpListener::bind(listen).await.map_err(failed)?;
     let address = listener.local_addr().map_err(failed)?;
@@ -361,6 +422,7 @@ async fn run<I, C>(
     look_every: Duration,
     incoming: I,
     guard: GuardLayer,
+    web: Option<impl Future<Output = ()>>,
 ) -> Result<(), CoordinatorError>
 where
     I: Stream<Item = io::Result<C>> + Send,
@@ -388,30 +450,27 @@ where
         .http2_keepalive_timeout(Some(KEEPALIVE_TIMEOUT))
         .max_concurrent_streams(MAX_CALLS_OF_A_CONNECTION)
         .tcp_nodelay(true)
+        .add_routes(user_services(&shared))
         .add_service(health_service)
         .add_service(older)
         .add_service(newer)
         .add_service(
-            JobServiceServer::new(Jobs(Arc::clone(&shared))).max_decoding_message_size(MAX_MESSAGE_BYTES),
-        )
-        .add_service(
-            UploadServiceServer::new(Uploads(Arc::clone(&shared)))
-                .max_decoding_message_size(MAX_UPLOAD_MESSAGE_BYTES),
-        )
-        .add_service(
             WorkerServiceServer::new(Workers(Arc::clone(&shared)))
                 .max_decoding_message_size(MAX_MESSAGE_BYTES),
-        )
-        .add_service(
-            AdminServiceServer::new(Admin(Arc::clone(&shared))).max_decoding_message_size(MAX_MESSAGE_BYTES),
         )
         .serve_with_incoming_shutdown(incoming, async move { stopped(&mut stopping).await });
     let own_tasks = run_own_tasks(Arc::clone(&shared));
     let house = collect_garbage(Arc::clone(&shared), look_every);
     let disowned = release_disowned(Arc::clone(&shared));
     let sweeper = sweep_leases(shared);
+    let mut web_runs = web.is_some();
+    let web = async {
+        if let Some(web) = web {
+            web.await;
+        }
+    };
     // All of them end on stop: open calls are answered, own tasks are given back.
-    tokio::pin!(server, sweeper, own_tasks, house, disowned);
+    tokio::pin!(server, web, sweeper, own_tasks, house, disowned);
     let mut own_tasks_run = true;
     let mut sweeper_runs = true;
     let mut house_is_kept = true;
@@ -424,15 +483,30 @@ where
                     // They give their tasks back.
                     let _ = tokio::time::timeout(STOP_WITHIN / 2, &mut own_tasks).await;
                 }
+                if web_runs {
+                    // Its open requests are answered.
+                    let _ = tokio::time::timeout(STOP_WITHIN / 4, &mut web).await;
+                }
                 return served.map_err(|e| CoordinatorError::Server(e.to_string()));
             }
             swept = &mut sweeper, if sweeper_runs => {
                 swept?;
                 sweeper_runs = false;
             }
+            () = &mut web, if web_runs => web_runs = false,
             () = &mut own_tasks, if own_tasks_run => own_tasks_run = false,
             () = &mut house, if house_is_kept => house_is_kept = false,
             () = &mut disowned, if disowned_are_looked_for => disowned_are_looked_for = false,
         }
     }
+}
+
+/// The services of users, for gRPC and for the HTTP interface.
+fn user_services(shared: &Arc<State>) -> Routes {
+    let jobs = JobServiceServer::new(Jobs(Arc::clone(shared)));
+    let uploads = UploadServiceServer::new(Uploads(Arc::clone(shared)));
+    let admin = AdminServiceServer::new(Admin(Arc::clone(shared)));
+    Routes::new(jobs.max_decoding_message_size(MAX_MESSAGE_BYTES))
+        .add_service(uploads.max_decoding_message_size(MAX_UPLOAD_MESSAGE_BYTES))
+        .add_service(admin.max_decoding_message_size(MAX_MESSAGE_BYTES))
 }

@@ -30,8 +30,9 @@ use crate::rate_limited_log::RateLimitedLog;
 
 /// Interval of the checks. A change is in use after two checks.
 const LOOK_EVERY: Duration = Duration::from_secs(2);
-/// The ALPN protocol of gRPC.
+/// The ALPN protocols: gRPC is HTTP/2, and many clients of the HTTP interface speak HTTP/1.1 only.
 const HTTP2: &[u8] = b"h2";
+const HTTP1: &[u8] = b"http/1.1";
 
 /// The server's identity and trusted authorities, from the latest valid files.
 pub struct Tls {
@@ -49,7 +50,8 @@ impl Tls {
     /// # Errors
     /// When a file cannot be read, or lacks its content.
     pub fn read(config: &CoordinatorConfig) -> Result<Option<Arc<Self>>, CoordinatorError> {
-        Self::of(config, Clients { ca: config.client_ca.clone(), all_present_certificates: false })
+        let clients = Clients { ca: config.client_ca.clone(), ..Clients::default() };
+        Self::of(config, clients)
     }
 
     /// The TLS of the scaler's address, where every client must present a certificate; `None` for plain text.
@@ -58,7 +60,16 @@ impl Tls {
     /// As [`Self::read`].
     pub fn of_scaler(config: &CoordinatorConfig) -> Result<Option<Arc<Self>>, CoordinatorError> {
         let Some(ca) = config.scaler_client_ca.clone() else { return Ok(None) };
-        Self::of(config, Clients { ca: Some(ca), all_present_certificates: true })
+        Self::of(config, Clients { ca: Some(ca), all_present_certificates: true, ..Clients::default() })
+    }
+
+    /// The TLS of the HTTP interface; `None` for plain text. It asks for no certificates: a browser would ask
+    /// its user which one to show.
+    ///
+    /// # Errors
+    /// As [`Self::read`].
+    pub fn of_web(config: &CoordinatorConfig) -> Result<Option<Arc<Self>>, CoordinatorError> {
+        Self::of(config, Clients { speak_http1: true, ..Clients::default() })
     }
 
     fn of(config: &CoordinatorConfig, clients: Clients) -> Result<Option<Arc<Self>>, CoordinatorError> {
@@ -142,11 +153,15 @@ struct Files {
     clients: Clients,
 }
 
-/// Whose certificates count.
+/// Who connects.
+#[derive(Default)]
 struct Clients {
+    /// Whose certificates count.
     ca: Option<PathBuf>,
     /// Whether a client without a certificate is refused in the handshake.
     all_present_certificates: bool,
+    /// Whether they may speak HTTP/1.1.
+    speak_http1: bool,
 }
 
 /// Content of the files.
@@ -156,6 +171,7 @@ struct Pems {
     key: String,
     client_ca: Option<String>,
     all_present_certificates: bool,
+    speak_http1: bool,
 }
 
 impl Files {
@@ -165,6 +181,7 @@ impl Files {
             key: read_pem(&self.key, "PRIVATE KEY")?,
             client_ca: self.clients.ca.as_deref().map(|path| read_pem(path, "CERTIFICATE")).transpose()?,
             all_present_certificates: self.clients.all_present_certificates,
+            speak_http1: self.clients.speak_http1,
         })
     }
 
@@ -220,6 +237,9 @@ impl Pems {
         let config = builder.with_single_cert(certificates(&self.cert)?, key);
         let mut config = config.map_err(|error| wrong(&error))?;
         config.alpn_protocols.push(HTTP2.to_vec());
+        if self.speak_http1 {
+            config.alpn_protocols.push(HTTP1.to_vec());
+        }
         Ok(Arc::new(config))
     }
 }
@@ -255,6 +275,7 @@ mod tests {
             key: String::new(),
             client_ca: None,
             all_present_certificates: false,
+            speak_http1: false,
         };
         Ok(none)
     }

@@ -25,3 +25,4 @@ mod stages;
 mod stragglers;
 #[path = "../support/cluster.rs"]
 mod support;
+mod web;

@@ -36,3 +36,4 @@ mod store;
 mod store_faults;
 mod train;
 mod two_coordinators;
+mod view;

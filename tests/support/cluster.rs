@@ -69,6 +69,7 @@ impl TestCluster {
         change(&mut config);
         let coordinator = serve(config.clone()).await.unwrap();
         config.listen = coordinator.address();
+        config.web = coordinator.web_address();
         let channel = Dial::to(&coordinator.url()).lazily().unwrap();
         let manifest = upload_scene(&BlobClient::new(channel.clone())).await;
         Self { dir, manifest, coordinator: Some(coordinator), config, channel }
@@ -93,6 +94,11 @@ impl TestCluster {
     /// Where the coordinator serves KEDA.
     pub fn scaler_address(&self) -> SocketAddr {
         self.coordinator.as_ref().unwrap().scaler_address().unwrap()
+    }
+
+    /// Where the coordinator serves the HTTP interface.
+    pub fn web_address(&self) -> SocketAddr {
+        self.coordinator.as_ref().unwrap().web_address().unwrap()
     }
 
     /// A response of the coordinator over HTTP.

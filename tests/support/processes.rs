@@ -174,7 +174,7 @@ impl Service {
 
     /// Waits until a coordinator with piped output is ready, and returns its URL.
     pub fn wait_until_it_listens(&mut self) -> String {
-        let stdout = self.child.stdout.take().expect("a pipe");
+        let stdout = self.stdout();
         let mut line = String::new();
         BufReader::new(stdout).read_line(&mut line).expect("a line");
         let url = line.trim_end().strip_prefix("listening on ");
@@ -191,6 +191,11 @@ impl Service {
         let arguments =
             ["worker", "--coordinator", url, "--name", name, "--cache-dir", cache_dir, "--allow-cpu"];
         Self::start(&arguments, Stdio::null())
+    }
+
+    /// What a service with piped output prints.
+    pub fn stdout(&mut self) -> std::process::ChildStdout {
+        self.child.stdout.take().expect("a pipe")
     }
 
     /// SIGKILL: nothing is cleaned up.

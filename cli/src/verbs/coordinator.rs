@@ -64,6 +64,10 @@ pub struct CoordinatorSettings {
     /// authentication [default: nowhere]
     #[arg(long, value_name = "ADDRESS:PORT", env = "FATHOM_METRICS_LISTEN", value_parser = super::parse_address)]
     metrics_listen: Option<SocketAddr>,
+    /// Address that serves the HTTP interface (JSON, server-sent events and gRPC-Web), with the same TLS and
+    /// tokens; beyond this machine it needs both [default: nowhere]
+    #[arg(long, value_name = "ADDRESS:PORT", env = "FATHOM_WEB", value_parser = super::parse_address)]
+    web: Option<SocketAddr>,
     /// Address that tells KEDA how many workers to start; beyond this machine it needs --tls-cert, --tls-key
     /// and --scaler-client-ca [default: nowhere]
     #[arg(long, value_name = "ADDRESS:PORT", env = "FATHOM_SCALER_LISTEN", value_parser = super::parse_address)]

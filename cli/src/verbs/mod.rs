@@ -19,6 +19,7 @@ mod synth;
 mod tenant;
 mod token;
 mod train;
+mod view;
 mod watch;
 mod worker;
 mod workers;
@@ -95,6 +96,8 @@ pub enum Verb {
     Eval(eval::EvalArgs),
     /// Render a model from given cameras, along a path through them, or from around it
     Render(render::RenderArgs),
+    /// Show a model in the browser, with the water that was trained
+    View(view::ViewArgs),
     /// Write a model for other programs, its colours in sRGB or in linear light
     Export(export::ExportArgs),
     /// Make a synthetic scene with exact ground truth
@@ -147,6 +150,7 @@ impl Verb {
             Self::Inspect(args) => inspect::run(args),
             Self::Eval(args) => eval::run(args),
             Self::Render(args) => render::run(args),
+            Self::View(args) => block_on(view::run(args)),
             Self::Export(args) => export::run(args),
             Self::Synth(args) => synth::run(args),
             Self::Doctor(args) => doctor::run(args),

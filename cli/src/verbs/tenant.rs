@@ -1,8 +1,8 @@
 //! `fathom tenant`: the tenants of a service, their usage and their limits.
 
 use clap::{Args, Subcommand};
+use fathom_coordinator::json;
 use fathom_proto::admin::v1::{Quota, SetQuotaRequest, Tenant};
-use serde_json::{Value, json};
 
 use super::ServiceArgs;
 use crate::client::Client;
@@ -65,7 +65,7 @@ pub async fn run(args: TenantArgs) -> Result<()> {
             let client = args.service.client().await?;
             let tenants = client.tenants().await?;
             if args.json {
-                return output::json(&tenants.iter().map(tenant_json).collect::<Vec<_>>());
+                return output::json(&tenants.iter().map(json::tenant).collect::<Vec<_>>());
             }
             tenants.iter().for_each(|tenant| output::line(tenant_line(tenant)));
             Ok(())
@@ -100,7 +100,7 @@ async fn limit(args: LimitArgs) -> Result<()> {
     };
     let tenant = client.set_quota(SetQuotaRequest { tenant: args.tenant, quota }).await?;
     if args.json {
-        return output::json(&tenant_json(&tenant));
+        return output::json(&json::tenant(&tenant));
     }
     output::line(tenant_line(&tenant));
     Ok(())
@@ -124,19 +124,4 @@ fn tenant_line(tenant: &Tenant) -> String {
         of(output::bytes(tenant.bytes), quota.max_bytes, output::bytes(quota.max_bytes)),
         if tenant.quota_is_own { " (limits of its own)" } else { "" }
     )
-}
-
-fn tenant_json(tenant: &Tenant) -> Value {
-    let quota = tenant.quota.unwrap_or_default();
-    let limit = |most: u64| (most > 0).then_some(most);
-    json!({
-        "tenant": tenant.name,
-        "open_jobs": tenant.open_jobs,
-        "leased_tasks": tenant.leased_tasks,
-        "bytes": tenant.bytes,
-        "max_open_jobs": limit(quota.max_open_jobs.into()),
-        "max_parallel": limit(quota.max_parallel.into()),
-        "max_bytes": limit(quota.max_bytes),
-        "own_limits": tenant.quota_is_own,
-    })
 }

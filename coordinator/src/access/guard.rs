@@ -57,8 +57,8 @@ const LOOKS: [&str; 5] = ["GetJob", "ListJobs", "WatchJob", "StreamLogs", "ListA
 /// Methods of UploadService that change nothing and that users call.
 const LOOKS_AT_UPLOADS: [&str; 3] = ["ReadBlob", "GetDataset", "ListDatasets"];
 /// Methods of UploadService about blobs, which workers also use.
-const OF_BLOBS: [&str; 6] =
-    ["FindMissingBlobs", "WriteBlob", "QueryBlob", "ReadBlob", "SignWrite", "FinishWrite"];
+const OF_BLOBS: [&str; 7] =
+    ["FindMissingBlobs", "WriteBlob", "WriteChunk", "QueryBlob", "ReadBlob", "SignWrite", "FinishWrite"];
 
 /// Whether a caller's role may call a method; operators of one tenant may call fewer.
 fn may(caller: &Principal, service: &str, method: &str) -> bool {
@@ -313,7 +313,8 @@ mod tests {
             "{worker:?}"
         );
         let of_uploads: Vec<_> = worker.iter().filter_map(|path| path.strip_prefix(UPLOADS)).collect();
-        let of_blobs = ["FindMissingBlobs", "FinishWrite", "QueryBlob", "ReadBlob", "SignWrite", "WriteBlob"];
+        let mut of_blobs = OF_BLOBS;
+        of_blobs.sort_unstable();
         assert_eq!(of_uploads, of_blobs.map(|method| format!("/{method}")));
         let operator = allowed(&caller(Role::Operator, None));
         assert!(METHODS.iter().all(|path| operator.contains(path) || path.starts_with(WORKERS)));

@@ -96,7 +96,7 @@ impl Kind {
     /// The kind of a method.
     pub fn of(method: &str) -> Self {
         match method {
-            "WriteBlob" => Self::Upload,
+            "WriteBlob" | "WriteChunk" => Self::Upload,
             "ReadBlob" => Self::Download,
             "Session" => Self::Session,
             _ => Self::Request,

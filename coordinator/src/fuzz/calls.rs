@@ -288,22 +288,8 @@ fn fuzzed_calls_of_uploads_are_answered_or_refused() {
         let uploads = Uploads(Arc::clone(shared));
         match which {
             0 => uploads.find_missing_blobs(message(bytes)?).await.ok().map(drop),
-            // A stream cannot be made here; this is what the service does with its first message.
-            1 => {
-                let v1::WriteBlobRequest { blob, offset_bytes, data, finish, .. } =
-                    message::<v1::WriteBlobRequest>(bytes)?.into_inner();
-                let blob = encode::required_blob("blob", blob).ok()?;
-                let objects = shared.objects.of(&Tenant::default()).await.ok()?;
-                let Some(mut writer) = objects.begin_write(&blob, offset_bytes, None).await.ok()? else {
-                    return Some(());
-                };
-                writer.append(offset_bytes, data).await.ok()?;
-                if finish {
-                    writer.finish().await.ok().map(drop)
-                } else {
-                    writer.pause().await.ok().map(drop)
-                }
-            }
+            // It does what WriteBlob does with a stream of one message.
+            1 => uploads.write_chunk(message(bytes)?).await.ok().map(drop),
             2 => uploads.query_blob(message(bytes)?).await.ok().map(drop),
             3 => uploads.read_blob(message(bytes)?).await.ok().map(drop),
             4 => uploads.begin_upload(message(bytes)?).await.ok().map(drop),

@@ -7,8 +7,8 @@ use bytes::Bytes;
 use fathom_core::scene::BlobRef;
 use fathom_proto::v1::upload_service_server::UploadService;
 use fathom_proto::{CHUNK_BYTES, v1};
-use futures::StreamExt;
 use futures::stream::{self, BoxStream};
+use futures::{Stream, StreamExt};
 use tonic::{Code, Request, Response, Status, Streaming, async_trait};
 
 use super::{datasets, encode};
@@ -118,11 +118,11 @@ impl Uploads {
     async fn write(
         &self,
         caller: &Principal,
-        mut pieces: Streaming<v1::WriteBlobRequest>,
+        mut pieces: impl Stream<Item = Result<v1::WriteBlobRequest, Status>> + Unpin,
     ) -> Result<v1::WriteBlobResponse, ServiceError> {
         let empty = || ServiceError::BadArgument { field: "blob", message: "the stream is empty".into() };
-        let first = pieces.message().await.map_err(|status| ServiceError::Door(Box::new(status)))?;
-        let first = first.ok_or_else(empty)?;
+        let first = pieces.next().await.ok_or_else(empty)?;
+        let first = first.map_err(|status| ServiceError::Door(Box::new(status)))?;
         let blob = encode::required_blob("blob", first.blob.clone())?;
         let place = self.place(caller, &first.job_id).await?;
         let begun = place.objects.begin_write(&blob, first.offset_bytes, place.limit_bytes).await;
@@ -147,15 +147,15 @@ impl Uploads {
                     writer.pause().await?;
                     return Err(ObjectError::Interrupted.into());
                 }
-                next = pieces.message() => next,
+                next = pieces.next() => next,
             };
             match next {
-                Ok(Some(next)) => piece = next,
+                Some(Ok(next)) => piece = next,
                 // The client ended or disconnected without `finish`: the received bytes are kept for the next
                 // stream.
                 ended => {
                     let committed_size_bytes = writer.pause().await?;
-                    if let Err(status) = ended
+                    if let Some(Err(status)) = ended
                         && status.code() == Code::InvalidArgument
                     {
                         return Err(ServiceError::Door(Box::new(status)));
@@ -295,6 +295,15 @@ impl UploadService for Uploads {
     ) -> Result<Response<v1::WriteBlobResponse>, Status> {
         let caller = caller(&request)?;
         Ok(Response::new(self.write(&caller, request.into_inner()).await?))
+    }
+
+    async fn write_chunk(
+        &self,
+        request: Request<v1::WriteBlobRequest>,
+    ) -> Result<Response<v1::WriteBlobResponse>, Status> {
+        let caller = caller(&request)?;
+        let only = stream::iter([Ok(request.into_inner())]);
+        Ok(Response::new(self.write(&caller, only).await?))
     }
 
     async fn query_blob(

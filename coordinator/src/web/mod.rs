@@ -1,0 +1,171 @@
+//! The coordinator over HTTP: JSON for scripts, server-sent events, and gRPC-Web for the page in a browser.
+//!
+//! There is no second way in. A JSON handler makes a gRPC call inside this process, on the same services
+//! behind the same guard, with the token of its request. So tokens, roles, tenants, rates and limits are
+//! those of gRPC. What is added here is against other websites, which can make a browser call this address:
+//! `fathom_web::check` looks at Host and Origin.
+
+mod answer;
+mod api;
+mod events;
+mod files;
+mod read;
+
+use std::io;
+use std::sync::Arc;
+
+use axum::Router;
+use axum::extract::{Request, State};
+use axum::http::{HeaderValue, StatusCode, header};
+use axum::middleware::{Next, from_fn, from_fn_with_state};
+use axum::response::Response;
+use fathom_proto::admin::v1::admin_service_client::AdminServiceClient;
+use fathom_proto::v1::job_service_client::JobServiceClient;
+use fathom_proto::v1::upload_service_client::UploadServiceClient;
+use fathom_web::Refused;
+use futures::Stream;
+use tokio::io::{AsyncRead, AsyncWrite};
+use tonic::service::Routes;
+use tonic::transport::Server;
+use tonic::transport::server::Connected;
+use tonic_web::GrpcWebLayer;
+use tower_layer::Layer;
+
+use self::answer::Fault;
+use crate::access::Access;
+use crate::access::guard::Guarded;
+use crate::clock::Clock;
+use crate::connections::Visit;
+use crate::metrics::rpc::Rpc;
+use crate::server::{KEEPALIVE_EVERY, KEEPALIVE_TIMEOUT, MAX_CALLS_OF_A_CONNECTION};
+use crate::service_error::ServiceError;
+
+/// The services of users behind the guard, counted as all calls are.
+pub type Door = Rpc<Guarded<Routes>>;
+
+/// Largest answer of a service to a JSON handler: a job of a thousand partitions has some megabytes.
+const MAX_ANSWER_BYTES: usize = 64 << 20;
+/// Services that a page may call: not those of workers.
+const SERVICES: [&str; 3] =
+    ["fathom.v1.JobService", "fathom.v1.UploadService", "fathom.admin.v1.AdminService"];
+
+/// What every handler has.
+#[derive(Clone)]
+struct Web {
+    door: Door,
+    access: Arc<Access>,
+    clock: Clock,
+}
+
+impl Web {
+    fn jobs(&self) -> JobServiceClient<Door> {
+        JobServiceClient::new(self.door.clone()).max_decoding_message_size(MAX_ANSWER_BYTES)
+    }
+
+    fn uploads(&self) -> UploadServiceClient<Door> {
+        UploadServiceClient::new(self.door.clone()).max_decoding_message_size(MAX_ANSWER_BYTES)
+    }
+
+    fn admin(&self) -> AdminServiceClient<Door> {
+        AdminServiceClient::new(self.door.clone()).max_decoding_message_size(MAX_ANSWER_BYTES)
+    }
+}
+
+/// Serves until `stopped` ends and open requests are answered.
+///
+/// # Errors
+/// When the server fails.
+pub async fn serve<I, C>(
+    incoming: I,
+    door: Door,
+    access: Arc<Access>,
+    clock: Clock,
+    stopped: impl Future<Output = ()>,
+) -> Result<(), tonic::transport::Error>
+where
+    I: Stream<Item = io::Result<C>> + Send,
+    C: AsyncRead + AsyncWrite + Connected + Unpin + Send + 'static,
+{
+    Server::builder()
+        // Browsers without TLS, and curl, speak HTTP/1.
+        .accept_http1(true)
+        .http2_keepalive_interval(Some(KEEPALIVE_EVERY))
+        .http2_keepalive_timeout(Some(KEEPALIVE_TIMEOUT))
+        .max_concurrent_streams(MAX_CALLS_OF_A_CONNECTION)
+        .tcp_nodelay(true)
+        .add_routes(Routes::from(router(Web { door, access, clock })))
+        .serve_with_incoming_shutdown(incoming, stopped)
+        .await
+}
+
+fn router(web: Web) -> Router {
+    let calls = GrpcWebLayer::new().layer(web.door.clone());
+    let mut router = Router::new()
+        .nest("/api/v1", api::router().layer(from_fn_with_state(web.clone(), with_token)))
+        .fallback(no_such_page);
+    for service in SERVICES {
+        router = router.route_service(&format!("/{service}/{{method}}"), calls.clone());
+    }
+    let asks_for_tokens = web.access.asks_for_tokens();
+    router
+        .layer(from_fn(guard_headers))
+        .layer(from_fn(move |request, next| of_this_site(asks_for_tokens, request, next)))
+        .with_state(web)
+}
+
+/// Refuses a request without a valid token before anything of its body is read.
+async fn with_token(State(web): State<Web>, request: Request, next: Next) -> Result<Response, Fault> {
+    let visit = Visit::of(&request).cloned();
+    let shown = request.headers().get(header::AUTHORIZATION).map(HeaderValue::to_str).transpose();
+    let caller = match shown {
+        Ok(shown) => web.access.principal(shown, web.clock.now_ms()),
+        Err(_) => Err(crate::access::Refused::NotValid),
+    };
+    match (caller, visit) {
+        (Ok(_), visit) => {
+            if let Some(visit) = visit {
+                visit.admit();
+            }
+            Ok(next.run(request).await)
+        }
+        (Err(refused), visit) => {
+            if let Some(visit) = visit {
+                visit.call_without_token();
+            }
+            Err(Fault::of(ServiceError::from(refused).into()))
+        }
+    }
+}
+
+/// Passes a request on if no other website can have made it.
+async fn of_this_site(asks_for_tokens: bool, request: Request, next: Next) -> Result<Response, Fault> {
+    let named = request.uri().authority();
+    match fathom_web::check(request.headers(), named, asks_for_tokens) {
+        Ok(()) => Ok(next.run(request).await),
+        Err(Refused::Malformed(message)) => Err(Fault::bad(message)),
+        Err(Refused::OtherSite(message)) => Err(Fault::with(StatusCode::FORBIDDEN, "OTHER_SITE", message)),
+    }
+}
+
+async fn no_such_page(request: Request) -> Fault {
+    if let Some(visit) = Visit::of(&request) {
+        visit.call_without_token();
+    }
+    Fault::not_found("there is nothing at this address; the interface begins at /api/v1/jobs")
+}
+
+/// Headers for browsers: no answer is a page that may run anything, be framed, or be kept.
+async fn guard_headers(request: Request, next: Next) -> Response {
+    let mut answer = next.run(request).await;
+    let headers = answer.headers_mut();
+    for (name, value) in [
+        (header::CONTENT_SECURITY_POLICY, "default-src 'none'; frame-ancestors 'none'; sandbox"),
+        (header::X_CONTENT_TYPE_OPTIONS, "nosniff"),
+        (header::REFERRER_POLICY, "no-referrer"),
+        (header::CACHE_CONTROL, "no-store"),
+    ] {
+        headers.entry(name).or_insert(HeaderValue::from_static(value));
+    }
+    headers.insert("cross-origin-resource-policy", HeaderValue::from_static("same-origin"));
+    answer
+}

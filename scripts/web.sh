@@ -1,0 +1,96 @@
+#!/usr/bin/env bash
+# The pages for browsers (web/): builds them, checks them, and runs them in a browser.
+#
+#     scripts/web.sh build      web/dist from web/src
+#     scripts/web.sh check      types, lints, unit tests; and that the sources give the committed web/dist
+#     scripts/web.sh headless   the built pages in Chromium beside `fathom render` (quick: two small models)
+#
+# Needs npm and its registry; everything else, Node too, comes from web/package-lock.json. Chromium is that of
+# the system. Exits with 3 where npm or Chromium is missing, so that callers can tell "not checked" from
+# "wrong". With FATHOM_TEST_REQUIRE_BROWSER=1 that is a failure.
+#
+# FATHOM   the program (default: that of the development build)
+set -euo pipefail
+cd "$(dirname "$0")/../web"
+
+target=$(cd .. && realpath -m "${CARGO_TARGET_DIR:-target}")
+fathom=${FATHOM:-$target/debug/fathom}
+
+say() { printf 'web: %s\n' "$*" >&2; }
+not_checked() {
+    say "$*"
+    [ "${FATHOM_TEST_REQUIRE_BROWSER:-}" = 1 ] && exit 1
+    exit 3
+}
+
+# The packages of the lock file, unless they are there already.
+packages() {
+    command -v npm >/dev/null || not_checked "npm is missing, so the pages were not checked"
+    if ! cmp -s package-lock.json node_modules/.of-lock; then
+        npm ci --no-audit --no-fund --loglevel=error || not_checked "npm cannot fetch the packages, so the pages were not checked"
+        cp package-lock.json node_modules/.of-lock
+    fi
+    # Node of the lock file before that of the system.
+    PATH=$PWD/node_modules/.bin:$PATH
+}
+
+# Builds into a folder of its own. web/dist stays as it is: with another time of its files, cargo would build
+# all that contains it again.
+build_into() {
+    vite build --logLevel warn --emptyOutDir --outDir "$1"
+    node scripts/compress.mjs "$1"
+}
+
+# Every file of one folder, decompressed, is that of another: compressors may differ in their versions.
+same() {
+    local committed=$1 built=$2 name
+    diff <(cd "$committed" && find . -type f | sort) <(cd "$built" && find . -type f | sort) >&2 || return 1
+    while read -r name; do
+        cmp <(gzip -dc "$committed/$name") <(gzip -dc "$built/$name") >&2 || return 1
+    done < <(cd "$committed" && find . -type f | sort)
+}
+
+case "${1:-}" in
+    build)
+        packages
+        built=$(mktemp -d)
+        trap 'rm -rf "$built"' EXIT
+        build_into "$built"
+        if same dist "$built" 2>/dev/null; then
+            say "web/dist is current"
+        else
+            rm -rf dist
+            cp -r "$built" dist
+            chmod -R a+rX dist
+            say "web/dist is written"
+        fi
+        ;;
+    check)
+        packages
+        npm run --silent check
+        npm run --silent test
+        built=$(mktemp -d)
+        trap 'rm -rf "$built"' EXIT
+        build_into "$built" >/dev/null
+        if ! same dist "$built"; then
+            say "web/dist is not what web/src gives; run make web and commit web/dist"
+            exit 1
+        fi
+        ;;
+    headless)
+        packages
+        command -v chromium-headless-shell chromium google-chrome >/dev/null || [ -n "${CHROMIUM:-}" ] ||
+            not_checked "there is no Chromium, so the pages were not opened; run scripts/setup.sh --for-tests"
+        data=$(mktemp -d)
+        trap 'rm -rf "$data"' EXIT
+        scripts/make-test-data.sh "$fathom" "$data" ${2:+"$2"} >"$data/log" 2>&1 || {
+            tail -n 20 "$data/log" >&2
+            exit 1
+        }
+        VIEWER_DATA=$data npm run --silent headless
+        ;;
+    *)
+        sed -n '2,13p' "$0" | sed 's/^# \{0,1\}//'
+        exit 2
+        ;;
+esac

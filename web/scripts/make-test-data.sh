@@ -1,0 +1,64 @@
+#!/bin/sh
+# Makes the models and reference pictures of the headless test with `fathom`: about 5 minutes on 2 cores.
+#
+#   scripts/make-test-data.sh FATHOM DATA [quick]
+#
+# FATHOM is the program, DATA the folder to fill. The test reads DATA from VIEWER_DATA, or from test-data/.
+# With `quick` there are only two small models, one for each form of the water.
+set -eu
+fathom=$1
+data=$2
+mkdir -p "$data/renders"
+
+render() {
+    name=$1 folder=$2
+    shift 2
+    "$fathom" render "$data/$name/model.ply" --cameras "$data/$name/cameras.json" --allow-cpu \
+        -o "$data/renders/$name/$folder" "$@"
+}
+
+if [ "${3:-}" = quick ]; then
+    "$fathom" synth "$data/wreck" --views 16 --size 120x90
+    set -- --allow-cpu --max-gaussians 3000 --iterations 150
+    "$fathom" train "$data/wreck" -o "$data/pixel" --partitions 2x1 "$@"
+    "$fathom" train "$data/wreck" -o "$data/gaussian" --set water.medium=per_gaussian "$@"
+    for name in pixel gaussian; do
+        render "$name" clear --maps alpha,normal
+        render "$name" water --water on
+        render "$name" veil --water only
+    done
+    exit
+fi
+
+"$fathom" synth "$data/wreck" --views 24 --size 200x150
+"$fathom" synth "$data/reef" --look forward --views 24 --size 200x150
+
+train() {
+    name=$1 scene=$2
+    shift 2
+    "$fathom" train "$data/$scene" -o "$data/$name" --allow-cpu --max-gaussians 5000 "$@"
+}
+train pixel wreck --iterations 600 --partitions 2x1
+train gaussian wreck --iterations 600 --set water.medium=per_gaussian
+train gaussian_linear wreck --iterations 300 --set water.medium=per_gaussian --set water.blend=linear
+train maps wreck --iterations 600 --set water.blend=linear --set water.dbdr.mode=maps
+train open reef --iterations 600
+train air wreck --iterations 300 --preset 3dgs --set train.mip_filter=true
+
+# The same model, as if it had been trained in clear water: `render` reads the header alone.
+mkdir -p "$data/over_black"
+cp "$data/pixel/cameras.json" "$data/pixel/plan.json" "$data/over_black/"
+LC_ALL=C sed 's/"blend":"srgb"/"blend":"over_black"/' "$data/pixel/model.ply" > "$data/over_black/model.ply"
+
+# A model in other axes than its cameras and its water.
+mkdir -p "$data/aligned"
+"$fathom" export "$data/open" --frame aligned -o "$data/aligned/model.ply"
+cp "$data/open/cameras.json" "$data/open/plan.json" "$data/aligned/"
+
+for name in pixel gaussian gaussian_linear maps open aligned air over_black; do
+    render "$name" clear --maps alpha,normal
+done
+for name in pixel gaussian gaussian_linear maps open aligned over_black; do
+    render "$name" water --water on
+    render "$name" veil --water only
+done

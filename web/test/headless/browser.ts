@@ -1,0 +1,36 @@
+// Chromium without a screen, drawing on the CPU.
+
+import { existsSync } from 'node:fs';
+import { type Browser, type BrowserContextOptions, type Page, chromium } from 'playwright-core';
+
+const PATHS = ['/usr/bin/chromium-headless-shell', '/usr/bin/chromium', '/usr/bin/google-chrome'];
+const FLAGS = ['--no-sandbox', '--use-angle=swiftshader', '--enable-unsafe-swiftshader', '--ignore-gpu-blocklist'];
+
+export function browserPath(): string | null {
+    return process.env['CHROMIUM'] ?? PATHS.find((path) => existsSync(path)) ?? null;
+}
+
+export async function launch(flags: readonly string[] = FLAGS): Promise<Browser> {
+    const executablePath = browserPath();
+    if (executablePath === null) {
+        throw new Error('no Chromium: apt-get install chromium-headless-shell, or name it in CHROMIUM');
+    }
+    return chromium.launch({ executablePath, args: [...flags], headless: true });
+}
+
+/** A page that collects what the console and the policy complain about. */
+export async function newPage(
+    browser: Browser,
+    options: BrowserContextOptions = {},
+): Promise<{ page: Page; complaints: string[] }> {
+    const context = await browser.newContext({ viewport: { width: 1000, height: 700 }, ...options });
+    const page = await context.newPage();
+    const complaints: string[] = [];
+    page.on('console', (message) => {
+        if (message.type() === 'error' || message.type() === 'warning') {
+            complaints.push(message.text());
+        }
+    });
+    page.on('pageerror', (error) => complaints.push(String(error)));
+    return { page, complaints };
+}
