@@ -392,14 +392,13 @@ where
     C: AsyncRead + AsyncWrite + Connected + Unpin + Send + 'static,
 {
     let door = RpcLayer(Arc::clone(&shared.metrics)).layer(guard.layer(user_services(&shared)));
-    let (access, clock) = (Arc::clone(&shared.access), shared.clock);
     let mut stopping = shared.stopping.clone();
     let stops = async move { stopped(&mut stopping).await };
     let served = match tls {
-        None => web::serve(incoming, door, access, clock, stops).await,
+        None => web::serve(incoming, door, guard.0, stops).await,
         Some(tls) => {
             keep_fresh(&tls, &shared);
-            web::serve(tls.over(incoming), door, access, clock, stops).await
+            web::serve(tls.over(incoming), door, guard.0, stops).await
         }
     };
     if let Err(error) = served {

@@ -143,7 +143,7 @@ impl Guard {
 
     /// Logs refused calls without a valid token: a count, because a line for each would let unauthenticated
     /// clients fill the log.
-    fn log_refusal(&self, path: &str, visit: Option<&Visit>, error: &ServiceError) {
+    pub fn log_refusal(&self, path: &str, visit: Option<&Visit>, error: &ServiceError) {
         // The path is the caller's own text.
         let path: String = path.chars().take(100).collect();
         tracing::debug!(?path, %error, "refused a call");

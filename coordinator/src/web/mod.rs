@@ -32,9 +32,7 @@ use tonic_web::GrpcWebLayer;
 use tower_layer::Layer;
 
 use self::answer::Fault;
-use crate::access::Access;
-use crate::access::guard::Guarded;
-use crate::clock::Clock;
+use crate::access::guard::{Guard, Guarded};
 use crate::connections::Visit;
 use crate::metrics::rpc::Rpc;
 use crate::server::{KEEPALIVE_EVERY, KEEPALIVE_TIMEOUT, MAX_CALLS_OF_A_CONNECTION};
@@ -53,8 +51,7 @@ const SERVICES: [&str; 3] =
 #[derive(Clone)]
 struct Web {
     door: Door,
-    access: Arc<Access>,
-    clock: Clock,
+    guard: Arc<Guard>,
 }
 
 impl Web {
@@ -78,8 +75,7 @@ impl Web {
 pub async fn serve<I, C>(
     incoming: I,
     door: Door,
-    access: Arc<Access>,
-    clock: Clock,
+    guard: Arc<Guard>,
     stopped: impl Future<Output = ()>,
 ) -> Result<(), tonic::transport::Error>
 where
@@ -93,7 +89,7 @@ where
         .http2_keepalive_timeout(Some(KEEPALIVE_TIMEOUT))
         .max_concurrent_streams(MAX_CALLS_OF_A_CONNECTION)
         .tcp_nodelay(true)
-        .add_routes(Routes::from(router(Web { door, access, clock })))
+        .add_routes(Routes::from(router(Web { door, guard })))
         .serve_with_incoming_shutdown(incoming, stopped)
         .await
 }
@@ -106,7 +102,7 @@ fn router(web: Web) -> Router {
     for service in SERVICES {
         router = router.route_service(&format!("/{service}/{{method}}"), calls.clone());
     }
-    let asks_for_tokens = web.access.asks_for_tokens();
+    let asks_for_tokens = web.guard.access.asks_for_tokens();
     router
         .layer(from_fn(guard_headers))
         .layer(from_fn(move |request, next| of_this_site(asks_for_tokens, request, next)))
@@ -118,7 +114,7 @@ async fn with_token(State(web): State<Web>, request: Request, next: Next) -> Res
     let visit = Visit::of(&request).cloned();
     let shown = request.headers().get(header::AUTHORIZATION).map(HeaderValue::to_str).transpose();
     let caller = match shown {
-        Ok(shown) => web.access.principal(shown, web.clock.now_ms()),
+        Ok(shown) => web.guard.access.principal(shown, web.guard.clock.now_ms()),
         Err(_) => Err(crate::access::Refused::NotValid),
     };
     match (caller, visit) {
@@ -129,10 +125,12 @@ async fn with_token(State(web): State<Web>, request: Request, next: Next) -> Res
             Ok(next.run(request).await)
         }
         (Err(refused), visit) => {
+            let error = ServiceError::from(refused);
+            web.guard.log_refusal(request.uri().path(), visit.as_ref(), &error);
             if let Some(visit) = visit {
                 visit.call_without_token();
             }
-            Err(Fault::of(ServiceError::from(refused).into()))
+            Err(Fault::of(error.into()))
         }
     }
 }
