@@ -51,26 +51,31 @@ if [ "${1:-}" = --for-tests ] && ! have_postgres && command -v apt-get >/dev/nul
     packages+=(postgresql)
 fi
 
-# The same of the pages.
-if [ "${1:-}" = --for-tests ] && command -v apt-get >/dev/null; then
-    [ -n "${CHROMIUM:-}" ] || command -v chromium-headless-shell chromium google-chrome >/dev/null \
-        || packages+=(chromium-headless-shell)
-    command -v npm >/dev/null || packages+=(npm)
-fi
-
-if [ "${#packages[@]}" -gt 0 ]; then
+install() {
     command -v apt-get >/dev/null \
-        || fail "please install ${packages[*]} (Debian's names) with this system's package manager"
-    as_root=()
+        || fail "please install $* (Debian's names) with this system's package manager"
+    local as_root=()
     if [ "$(id -u)" -ne 0 ]; then
-        command -v sudo >/dev/null || fail "please install as root: apt-get install ${packages[*]}"
+        command -v sudo >/dev/null || fail "please install as root: apt-get install $*"
         as_root=(sudo)
     fi
-    say "installing ${packages[*]} with apt-get (about 1 minute)"
+    say "installing $* with apt-get (about 1 minute)"
     "${as_root[@]}" apt-get update -qq
-    "${as_root[@]}" env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends "${packages[@]}" \
-        >/dev/null
-    say "installed ${packages[*]}"
+    "${as_root[@]}" env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends "$@" >/dev/null
+    say "installed $*"
+}
+
+[ "${#packages[@]}" -eq 0 ] || install "${packages[@]}"
+
+# Each system has another browser, and none is needed but by the tests of pages, which say what they lack.
+if [ "${1:-}" = --for-tests ]; then
+    pages=()
+    [ -n "${CHROMIUM:-}" ] || command -v chromium-headless-shell chromium google-chrome >/dev/null \
+        || pages+=(chromium-headless-shell)
+    command -v npm >/dev/null || pages+=(npm)
+    if [ "${#pages[@]}" -gt 0 ]; then
+        (install "${pages[@]}") || say "without ${pages[*]} the pages are not tested"
+    fi
 fi
 
 if [ ! -e "${CARGO_TARGET_DIR:-target}/debug" ]; then

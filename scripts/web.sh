@@ -5,13 +5,15 @@
 #     scripts/web.sh check      types, lints, unit tests; and that the sources give the committed web/dist
 #     scripts/web.sh headless   the built pages in Chromium beside `fathom render` (quick: two small models)
 #
-# Needs npm and its registry; everything else, Node too, comes from web/package-lock.json. Chromium is that of
-# the system. Exits with 3 where npm or Chromium is missing, so that callers can tell "not checked" from
-# "wrong". With FATHOM_TEST_REQUIRE_BROWSER=1 that is a failure.
+# Needs npm and its registry. The packages, with Node as the package `node`, are those of
+# web/package-lock.json; Chromium is that of the system. Exits with 3 where npm or Chromium is missing, so
+# that callers can tell "not checked" from "wrong". With FATHOM_TEST_REQUIRE_BROWSER=1 that is a failure.
 #
-# FATHOM   the program (default: that of the development build)
+# FATHOM     the program (default: that of the development build)
+# CHROMIUM   the browser (default: the first of chromium-headless-shell, chromium and google-chrome)
 set -euo pipefail
-cd "$(dirname "$0")/../web"
+self=$(realpath "$0")
+cd "$(dirname "$self")/../web"
 
 target=$(cd .. && realpath -m "${CARGO_TARGET_DIR:-target}")
 fathom=${FATHOM:-$target/debug/fathom}
@@ -79,7 +81,11 @@ case "${1:-}" in
         ;;
     headless)
         packages
-        command -v chromium-headless-shell chromium google-chrome >/dev/null || [ -n "${CHROMIUM:-}" ] ||
+        # The first that there is; the tests take the same.
+        [ -n "${CHROMIUM:-}" ] || CHROMIUM=$(command -v chromium-headless-shell chromium google-chrome | head -n 1) ||
+            true
+        export CHROMIUM
+        [ -n "$CHROMIUM" ] ||
             not_checked "there is no Chromium, so the pages were not opened; run scripts/setup.sh --for-tests"
         data=$(mktemp -d)
         trap 'rm -rf "$data"' EXIT
@@ -90,7 +96,7 @@ case "${1:-}" in
         VIEWER_DATA=$data npm run --silent headless
         ;;
     *)
-        sed -n '2,13p' "$0" | sed 's/^# \{0,1\}//'
+        sed -n '2,13p' "$self" | sed 's/^# \{0,1\}//'
         exit 2
         ;;
 esac

@@ -62,6 +62,8 @@ pub const MAX_UPLOAD_MESSAGE_BYTES: usize = 12 << 20;
 pub const MAX_CALLS_OF_A_CONNECTION: u32 = 1024;
 /// Time that open calls have to end when the coordinator stops.
 const STOP_WITHIN: Duration = Duration::from_secs(5);
+/// Time that calls have to notice that their connections are closed.
+const CLOSE_WITHIN: Duration = Duration::from_secs(1);
 
 /// A running coordinator.
 pub struct Coordinator {
@@ -72,6 +74,7 @@ pub struct Coordinator {
     scaler_address: Option<SocketAddr>,
     stopping: watch::Sender<bool>,
     running: JoinHandle<Result<(), CoordinatorError>>,
+    connections: Arc<Connections>,
     shared: Arc<State>,
 }
 
@@ -128,10 +131,15 @@ impl Coordinator {
     /// When it had failed before.
     pub async fn stop(self) -> Result<(), CoordinatorError> {
         self.stopping.send_replace(true);
-        let Self { mut running, shared, .. } = self;
+        let Self { mut running, connections, shared, .. } = self;
         // The store closes when the server drops its own reference, too.
         drop(shared);
-        match tokio::time::timeout(STOP_WITHIN, &mut running).await {
+        if let Ok(result) = tokio::time::timeout(STOP_WITHIN, &mut running).await {
+            return flatten(result);
+        }
+        // Their calls hold the store, however slowly their clients read or write.
+        connections.close(true);
+        match tokio::time::timeout(CLOSE_WITHIN, &mut running).await {
             Ok(result) => flatten(result),
             Err(_) => {
                 running.abort();
@@ -163,7 +171,7 @@ pub async fn serve(config: CoordinatorConfig) -> Result<Coordinator, Coordinator
         None => None,
     };
     let for_web = match config.web {
-        Some(address) => Some((listen(address).await?, Tls::of_web(&config)?)),
+        Some(address) => Some((listen(address).await?, tls.as_ref().map(|tls| tls.for_web()).transpose()?)),
         None => None,
     };
     let for_scaler = match config.scaler_listen {
@@ -353,7 +361,7 @@ where
         let shared = Arc::clone(&shared);
         serve_web(shared, guard.clone(), tls, Arc::clone(&connections).of(accepted(listener)))
     });
-    let incoming = connections.of(incoming);
+    let incoming = Arc::clone(&connections).of(incoming);
     let running = match tls {
         None => tokio::spawn(run(Arc::clone(&shared), house.every, incoming, guard, web)),
         Some(tls) => {
@@ -370,6 +378,7 @@ where
         scheme,
         stopping,
         running,
+        connections,
         shared,
     })
 }
@@ -440,7 +449,7 @@ where
     // Many programs still use the older version of reflection.
     let (older, newer) =
         (reflection().build_v1alpha().map_err(failed)?, reflection().build_v1().map_err(failed)?);
-    let mut stopping = shared.stopping.clone();
+    let (mut stopping, stops) = (shared.stopping.clone(), shared.stopping.clone());
     let server = Server::builder()
         // Outermost, so that refused calls are counted too.
         .layer(RpcLayer(Arc::clone(&shared.metrics)))
@@ -478,14 +487,19 @@ where
         tokio::select! {
             biased;
             served = &mut server => {
-                if own_tasks_run {
-                    // They give their tasks back.
-                    let _ = tokio::time::timeout(STOP_WITHIN / 2, &mut own_tasks).await;
-                }
-                if web_runs {
-                    // Its open requests are answered.
-                    let _ = tokio::time::timeout(STOP_WITHIN / 4, &mut web).await;
-                }
+                let own_tasks = async {
+                    if own_tasks_run {
+                        // They give their tasks back.
+                        let _ = tokio::time::timeout(STOP_WITHIN / 2, &mut own_tasks).await;
+                    }
+                };
+                let web = async {
+                    // Its open requests are answered; [`Coordinator::stop`] bounds the time.
+                    if web_runs && *stops.borrow() {
+                        (&mut web).await;
+                    }
+                };
+                tokio::join!(own_tasks, web);
                 return served.map_err(|e| CoordinatorError::Server(e.to_string()));
             }
             swept = &mut sweeper, if sweeper_runs => {

@@ -63,13 +63,22 @@ impl Tls {
         Self::of(config, Clients { ca: Some(ca), all_present_certificates: true, ..Clients::default() })
     }
 
-    /// The TLS of the HTTP interface; `None` for plain text. It asks for no certificates: a browser would ask
-    /// its user which one to show.
+    /// The same identity for the HTTP interface. It asks for no certificates: a browser would ask its user
+    /// which one to show. The files are not read again, because a pipe can be read only once.
     ///
     /// # Errors
-    /// As [`Self::read`].
-    pub fn of_web(config: &CoordinatorConfig) -> Result<Option<Arc<Self>>, CoordinatorError> {
-        Self::of(config, Clients { speak_http1: true, ..Clients::default() })
+    /// When the content is unusable.
+    pub fn for_web(&self) -> Result<Arc<Self>, CoordinatorError> {
+        let clients = Clients { speak_http1: true, ..Clients::default() };
+        let files = Files { cert: self.files.cert.clone(), key: self.files.key.clone(), clients };
+        let first = Pems {
+            client_ca: None,
+            all_present_certificates: false,
+            speak_http1: true,
+            ..self.first.clone()
+        };
+        let in_use = RwLock::new(first.server_config().map_err(CoordinatorError::Config)?);
+        Ok(Arc::new(Self { files, first, in_use, failed: RateLimitedLog::default() }))
     }
 
     fn of(config: &CoordinatorConfig, clients: Clients) -> Result<Option<Arc<Self>>, CoordinatorError> {

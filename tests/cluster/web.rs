@@ -160,7 +160,9 @@ async fn json_calls_say_and_do_what_grpc_does() {
         let tag = file.headers()["etag"].clone();
         assert_eq!(file.bytes().await.unwrap(), content.as_slice(), "{name}");
         let known = http.request(Method::GET, &format!("{path}/files/{name}")).header("if-none-match", tag);
-        assert_eq!(known.send().await.unwrap().status(), StatusCode::NOT_MODIFIED);
+        let known = known.send().await.unwrap();
+        let kept = (StatusCode::NOT_MODIFIED, &HeaderValue::from_static("private, no-cache"));
+        assert_eq!((known.status(), &known.headers()["cache-control"]), kept);
     }
     let model = http.request(Method::GET, &format!("{path}/files/model.ply")).header("range", "bytes=100-");
     let model = model.send().await.unwrap();
@@ -173,6 +175,15 @@ async fn json_calls_say_and_do_what_grpc_does() {
         (model.status(), model.bytes().await.unwrap()),
         (StatusCode::PARTIAL_CONTENT, whole[100..].to_vec().into())
     );
+    let head = http.request(Method::HEAD, &format!("{path}/files/model.ply")).send().await.unwrap();
+    assert_eq!(head.headers()["content-length"], whole.len().to_string().as_str());
+    // A weak tag among others, as a proxy that compresses sends it.
+    let tag = format!("\"other\", W/{}", head.headers()["etag"].to_str().unwrap());
+    let known = http.request(Method::GET, &format!("{path}/files/model.ply")).header("if-none-match", tag);
+    assert_eq!(known.send().await.unwrap().status(), StatusCode::NOT_MODIFIED);
+    let metrics = cluster.page("/metrics").await.1;
+    let reads: Vec<_> = metrics.lines().filter(|line| line.contains("UploadService/ReadBlob")).collect();
+    assert!(!reads.is_empty() && !reads.iter().any(|line| line.contains("cancelled")), "{reads:?}");
     let beyond =
         http.request(Method::GET, &format!("{path}/files/model.ply")).header("range", "bytes=99999999-");
     assert_eq!(answer(beyond).await.0, 416);
@@ -300,6 +311,8 @@ async fn another_website_reaches_nothing() {
     assert_eq!(asks(&[("origin", &own), ("sec-fetch-site", "same-origin")]).await.0, 200);
     let refused = (403, "OTHER_SITE");
     assert_eq!(reason(&asks(&[("origin", "http://wreck.example")]).await), refused);
+    let foreign = http.request(Method::GET, "/jobs").header("origin", "http://wreck.example");
+    assert_eq!(foreign.send().await.unwrap().headers()["x-content-type-options"], "nosniff");
     assert_eq!(reason(&asks(&[("sec-fetch-site", "cross-site")]).await), refused);
     // A name that somebody made to point here.
     let rebound = format!("wreck.example:{}", here.port());
@@ -366,6 +379,7 @@ async fn tokens_roles_and_tenants_are_those_of_grpc() {
     cluster.operator().admin().revoke_token(revoke).await.unwrap();
     let rest = tokio::time::timeout(PATIENCE, events.text()).await.unwrap().unwrap_or_default();
     assert!(!rest.contains("event: end"), "{rest}");
+    assert!(rest.contains("event: fault") && rest.contains("TOKEN_REFUSED"), "{rest}");
     assert_eq!(reason(&http(Some(&wreck)).get("/jobs").await), (401, "TOKEN_REFUSED"));
 }
 
@@ -420,6 +434,29 @@ async fn events_go_on_behind_the_last_and_end_with_the_job() {
         http.request(Method::GET, &format!("{path}?after={}", durable.len() - 1)).send().await.unwrap();
     assert_eq!(blocks(&whole.text().await.unwrap()).len(), 2, "the last event and the end");
     assert_eq!(http.get(&path.replace(&job, &"0".repeat(job.len()))).await.0, 404);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_stop_waits_for_no_client_and_frees_the_store() {
+    let (mut cluster, _) = with_web().await;
+    let job = cluster.submit("a job", 1).await;
+    let address = cluster.web_address();
+    let begin = |request: String| async move {
+        let mut stream = TcpStream::connect(address).await.unwrap();
+        stream.write_all(request.as_bytes()).await.unwrap();
+        stream
+    };
+    let post = format!("POST /api/v1/jobs/{job}/pause HTTP/1.1\r\nHost: {address}\r\n");
+    let open = [
+        // Half a header, a body that does not come, and events that nobody reads.
+        begin(format!("GET /api/v1/jobs HTTP/1.1\r\nHost: {address}")).await,
+        begin(format!("{post}Content-Type: application/json\r\nContent-Length: 9\r\n\r\n")).await,
+        begin(format!("GET /api/v1/jobs/{job}/events HTTP/1.1\r\nHost: {address}\r\n\r\n")).await,
+    ];
+    // The store belongs to one coordinator, so the next one could not start.
+    cluster.restart().await;
+    assert_eq!(cluster.get(&job).await.job_id, job);
+    drop(open);
 }
 
 /// A message in a frame of gRPC-Web.
@@ -486,6 +523,10 @@ async fn a_page_calls_the_services_of_users_by_grpc_web() {
     let again = v1::WriteBlobRequest { blob: Some(whole.clone()), ..Default::default() };
     let (_, answer) = call(Some(&token), "fathom.v1.UploadService/WriteChunk", frame(&again)).await;
     assert!(v1::WriteBlobResponse::decode(frames(&answer).0[0]).unwrap().complete);
+    let long = v1::BlobRef { digest: whole.digest.clone(), size_bytes: (256 << 20) + 1 };
+    let long = v1::WriteBlobRequest { blob: Some(long), ..Default::default() };
+    let (refused, _) = call(Some(&token), "fathom.v1.UploadService/WriteChunk", frame(&long)).await;
+    assert_eq!(refused, Some((tonic::Code::InvalidArgument as i32).to_string()));
     // A stream of the server comes as several messages.
     let read = v1::ReadBlobRequest { digest: whole.digest.clone(), ..Default::default() };
     let (_, answer) = call(Some(&token), "fathom.v1.UploadService/ReadBlob", frame(&read)).await;

@@ -26,6 +26,8 @@ use crate::output;
 const PIECE_BYTES: usize = 256 << 10;
 /// What the viewer reads.
 const MODELS: [&str; 2] = ["ply", "sog"];
+/// Endings of photographs that browsers show.
+const PHOTOGRAPHS: [&str; 4] = ["png", "jpg", "jpeg", "webp"];
 
 /// Arguments of `fathom view`.
 #[derive(Args, Debug)]
@@ -123,14 +125,15 @@ fn names(cameras: &Value) -> impl Iterator<Item = &str> {
 }
 
 /// The file of a photograph, in the folder of the photographs or of the scene. Names come from a file that
-/// may be somebody else's, so one that leaves the folder is no photograph.
+/// may be somebody else's, so one that leaves the folder or is no picture is no photograph.
 fn photograph(folder: &Path, name: &str) -> Option<PathBuf> {
     let whole = folder.canonicalize().ok()?;
     let found = [folder.join(name), folder.join("images").join(name)];
-    found
-        .into_iter()
-        .filter_map(|path| path.canonicalize().ok())
-        .find(|path| path.starts_with(&whole) && path.is_file())
+    let mut found = found.into_iter().filter_map(|path| path.canonicalize().ok());
+    found.find(|path| {
+        let ending = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
+        path.starts_with(&whole) && path.is_file() && PHOTOGRAPHS.contains(&ending.as_str())
+    })
 }
 
 struct Served {
@@ -189,7 +192,12 @@ async fn answer(State(served): State<Arc<Served>>, request: Request) -> Response
         return match contents(file).await {
             Ok((bytes, body)) => {
                 let kind = HeaderValue::from_static(fathom_web::kind_of(path));
-                let fields = [(header::CONTENT_TYPE, kind), (header::CONTENT_LENGTH, bytes.into()), KEPT];
+                let fields = [
+                    (header::CONTENT_TYPE, kind),
+                    (header::CONTENT_LENGTH, bytes.into()),
+                    (header::X_CONTENT_TYPE_OPTIONS, HeaderValue::from_static("nosniff")),
+                    KEPT,
+                ];
                 (fields, body).into_response()
             }
             Err(error) => text(StatusCode::NOT_FOUND, format!("cannot read {}: {error}", file.display())),
@@ -235,11 +243,15 @@ mod tests {
         let error = read(&[out]).unwrap_err().to_string();
         assert!(error.contains("model.ply is no file"), "{error}");
         std::fs::write(at("model.ply"), "ply\n").unwrap();
-        std::fs::write(at("cameras.json"), r#"[{"img_name": "a b.png"}, {"img_name": "../../secret.png"}]"#)
-            .unwrap();
+        std::fs::write(
+            at("cameras.json"),
+            r#"[{"img_name": "a b.png"}, {"img_name": "../secret.png"}, {"img_name": "page.html"}]"#,
+        )
+        .unwrap();
         std::fs::create_dir(at("photographs")).unwrap();
         std::fs::create_dir(at("photographs/images")).unwrap();
         std::fs::write(at("secret.png"), "").unwrap();
+        std::fs::write(at("photographs/page.html"), "").unwrap();
         let photographs = at("photographs");
         let words = [out, "--photographs", photographs.to_str().unwrap(), "--credits", "me"];
         let error = read(&words).unwrap_err().to_string();
@@ -247,7 +259,7 @@ mod tests {
         std::fs::write(at("photographs/images/a b.png"), "").unwrap();
         let scene = read(&words).unwrap();
         let json: Value = serde_json::from_str(&scene.json).unwrap();
-        // A name that leaves the folder is left out.
+        // A name that leaves the folder is left out, and so is a page.
         assert_eq!(json["photographs"], json!({"a b.png": "photographs/0.png"}));
         assert_eq!(
             (&json["model"], &json["water"], &json["credits"]),

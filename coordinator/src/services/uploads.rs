@@ -22,6 +22,8 @@ use crate::state::{State, stopped};
 
 /// Maximum blobs in one call.
 pub(super) const MAX_BLOBS: usize = 10_000;
+/// Longest blob that is sent in calls of one piece: each call reads and hashes again what has arrived.
+const MAX_CHUNKED_BYTES: u64 = 256 << 20;
 /// Bytes of a sent piece. Clients that read nothing leave as many pieces in memory as there are places; with
 /// blobs in a bucket, as many requests ([`BlobStore::read_bytes`]).
 const READ_BYTES: usize = 256 << 10;
@@ -302,7 +304,12 @@ impl UploadService for Uploads {
         request: Request<v1::WriteBlobRequest>,
     ) -> Result<Response<v1::WriteBlobResponse>, Status> {
         let caller = caller(&request)?;
-        let only = stream::iter([Ok(request.into_inner())]);
+        let request = request.into_inner();
+        if request.blob.as_ref().is_some_and(|blob| blob.size_bytes > MAX_CHUNKED_BYTES) {
+            let message = format!("has more than {MAX_CHUNKED_BYTES} bytes; send it with WriteBlob");
+            return Err(ServiceError::BadArgument { field: "blob", message }.into());
+        }
+        let only = stream::iter([Ok(request)]);
         Ok(Response::new(self.write(&caller, only).await?))
     }
 

@@ -48,7 +48,7 @@ impl Fault {
         Self {
             status: http_status(status.code()),
             // Errors of the transport have no reason of ours.
-            reason: reason.unwrap_or_else(|| format!("{:?}", status.code())),
+            reason: reason.unwrap_or_else(|| reason_of(status.code()).to_owned()),
             message: status.message().to_owned(),
             fields: fields.into_iter().map(|field| (field.field, field.description)).collect(),
             retry_after: pause.map(|pause| pause.as_secs_f64().ceil().max(1.0) as u64),
@@ -84,6 +84,16 @@ impl IntoResponse for Fault {
             headers.insert(header::RETRY_AFTER, seconds.into());
         }
         response
+    }
+}
+
+/// The reason of an error of the transport, which has none of its own.
+fn reason_of(code: Code) -> &'static str {
+    match code {
+        Code::Unavailable => "UNAVAILABLE",
+        Code::DeadlineExceeded | Code::Cancelled => "TOO_SLOW",
+        Code::InvalidArgument => "BAD_ARGUMENT",
+        _ => "INTERNAL",
     }
 }
 

@@ -1,12 +1,14 @@
 //! The events of a job as server-sent events (WHATWG HTML, 9.2).
 
 use std::convert::Infallible;
+use std::sync::{Arc, Mutex, PoisonError};
 
 use axum::extract::State;
 use axum::http::HeaderMap;
+use axum::response::IntoResponse;
 use axum::response::sse::{Event, Sse};
 use fathom_proto::v1;
-use futures::{Stream, StreamExt, stream};
+use futures::{StreamExt, stream};
 use serde::Deserialize;
 use serde_json::json;
 
@@ -29,8 +31,8 @@ pub async fn watch(
     Asked(After { after }): Asked<After>,
     headers: HeaderMap,
     caller: Caller,
-) -> Result<Sse<impl Stream<Item = Result<Event, Infallible>>>, Fault> {
-    let last = match headers.get("last-event-id") {
+) -> Result<impl IntoResponse, Fault> {
+    let last = match headers.get("last-event-id").filter(|last| !last.is_empty()) {
         None => None,
         Some(last) => {
             let number = last.to_str().ok().and_then(|last| last.parse::<u64>().ok());
@@ -40,12 +42,29 @@ pub async fn watch(
     let after_seq = last.or(after).unwrap_or_default();
     let request = v1::WatchJobRequest { job_id: job_id.clone(), after_seq };
     let events = web.jobs().watch_job(caller.asks(request)).await?.into_inner();
-    let sent = events.map(|event| match event {
-        Ok(event) => said(&event),
-        Err(status) => of("error", None, &Fault::of(status).json()),
+    // The number of the last event that was sent; `None` once the stream has said that it cannot go on.
+    let sent = Arc::new(Mutex::new(Some(after_seq)));
+    let progress = Arc::clone(&sent);
+    let events = events.map(move |event| {
+        let mut sent = progress.lock().unwrap_or_else(PoisonError::into_inner);
+        match event {
+            Ok(event) => {
+                *sent = sent.map(|_| event.seq);
+                said(&event)
+            }
+            Err(status) => {
+                *sent = None;
+                of("fault", None, &Fault::of(status).json())
+            }
+        }
     });
-    let end = stream::once(async move { last_word(&web, job_id, &caller).await });
-    Ok(Sse::new(sent.chain(end).map(Ok)))
+    let end = stream::once(async move {
+        let last = *sent.lock().unwrap_or_else(PoisonError::into_inner);
+        last_word(&web, job_id, &caller, last).await
+    });
+    // A proxy that collects answers would hold events back.
+    let at_once = [("x-accel-buffering", "no")];
+    Ok((at_once, Sse::new(events.chain(end).map(Ok::<_, Infallible>))))
 }
 
 fn said(event: &v1::JobEvent) -> Event {
@@ -70,14 +89,17 @@ fn of(kind: &str, number: Option<u64>, value: &serde_json::Value) -> Event {
     }
 }
 
-/// The stream also ends when the coordinator stops. `end` is sent only where the job has ended, so that a
-/// client knows whether to come back.
-async fn last_word(web: &Web, job_id: String, caller: &Caller) -> Event {
-    let job = web.jobs().get_job(caller.asks(v1::GetJobRequest { job_id })).await;
-    match job.map(|job| job.into_inner().state()) {
-        Ok(state) if state != v1::JobState::Running && state != v1::JobState::Paused => {
-            of("end", None, &json!({"state": json::job_state(state)}))
+/// The stream also ends when the coordinator stops, or by a fault. `end` is sent only where the job has ended
+/// and its last event was sent, so that a client knows whether to come back.
+async fn last_word(web: &Web, job_id: String, caller: &Caller, sent: Option<u64>) -> Event {
+    if let Some(sent) = sent
+        && let Ok(job) = web.jobs().get_job(caller.asks(v1::GetJobRequest { job_id })).await
+    {
+        let job = job.into_inner();
+        let is_open = matches!(job.state(), v1::JobState::Running | v1::JobState::Paused);
+        if !is_open && sent >= job.last_seq {
+            return of("end", None, &json!({"state": json::job_state(job.state())}));
         }
-        _ => Event::default().comment("interrupted; connect again"),
     }
+    Event::default().comment("interrupted; connect again")
 }

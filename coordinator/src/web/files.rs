@@ -3,11 +3,13 @@
 use axum::Json;
 use axum::body::Body;
 use axum::extract::State;
-use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
+use axum::http::{HeaderMap, HeaderValue, Method, StatusCode, header};
 use axum::response::{IntoResponse, Response};
+use bytes::Bytes;
 use fathom_proto::v1;
-use futures::{StreamExt, stream};
+use futures::{Stream, stream};
 use serde_json::json;
+use tonic::{Status, Streaming};
 
 use super::Web;
 use super::answer::{Answer, Fault};
@@ -37,14 +39,16 @@ pub async fn list(
 pub async fn read(
     State(web): State<Web>,
     At((job_id, path)): At<(String, String)>,
+    method: Method,
     headers: HeaderMap,
     caller: Caller,
 ) -> Result<Response, Fault> {
     let blob = find(&web, &caller, &job_id, &path).await?;
     let tag = format!("\"{}\"", blob.digest);
+    let kept = (header::CACHE_CONTROL, HeaderValue::from_static("private, no-cache"));
     // Content of a digest never changes.
-    if headers.get(header::IF_NONE_MATCH).is_some_and(|known| known.as_bytes() == tag.as_bytes()) {
-        return Ok((StatusCode::NOT_MODIFIED, [(header::ETAG, tag)]).into_response());
+    if headers.get_all(header::IF_NONE_MATCH).iter().any(|known| names(known, &tag)) {
+        return Ok((StatusCode::NOT_MODIFIED, [kept], [(header::ETAG, tag)]).into_response());
     }
     let whole = blob.size_bytes;
     // A range of another state of the file is answered with the whole file (RFC 9110, 13.1.5).
@@ -57,12 +61,16 @@ pub async fn read(
         return Ok((range, fault).into_response());
     }
     let offset_bytes = first.unwrap_or_default();
-    let request = v1::ReadBlobRequest { digest: blob.digest, offset_bytes, job_id, direct: false };
-    let mut pieces = web.uploads().read_blob(caller.asks(request)).await?.into_inner();
-    // The first piece before any header, so that a missing file is an error and no empty answer.
-    let begin = pieces.message().await?;
-    let content = stream::iter(begin.map(Ok)).chain(pieces).map(|piece| piece.map(|piece| piece.data));
-    let mut answer = Response::new(Body::from_stream(content));
+    let body = if method == Method::HEAD {
+        Body::empty()
+    } else {
+        let request = v1::ReadBlobRequest { digest: blob.digest, offset_bytes, job_id, direct: false };
+        let mut pieces = web.uploads().read_blob(caller.asks(request)).await?.into_inner();
+        // The first piece before any header, so that a missing file is an error and no empty answer.
+        let first = pieces.message().await?;
+        Body::from_stream(contents(first, pieces))
+    };
+    let mut answer = Response::new(body);
     if first.is_some() {
         *answer.status_mut() = StatusCode::PARTIAL_CONTENT;
         let range = format!("bytes {offset_bytes}-{}/{whole}", whole.saturating_sub(1));
@@ -74,9 +82,28 @@ pub async fn read(
     fields.insert(header::CONTENT_LENGTH, (whole - offset_bytes).into());
     fields.insert(header::CONTENT_TYPE, HeaderValue::from_static(fathom_web::kind_of(&path)));
     fields.insert(header::ACCEPT_RANGES, HeaderValue::from_static("bytes"));
-    fields.insert(header::CACHE_CONTROL, HeaderValue::from_static("private, no-cache"));
+    fields.extend([kept]);
     fields.extend(HeaderValue::try_from(tag).ok().map(|tag| (header::ETAG, tag)));
     Ok(answer)
+}
+
+/// The bytes of a blob's pieces. The last piece is sent when the call has ended. Otherwise the server, which
+/// reads no further once it has sent all bytes, would drop the call, and it would count as cancelled.
+fn contents(
+    first: Option<v1::ReadBlobResponse>,
+    pieces: Streaming<v1::ReadBlobResponse>,
+) -> impl Stream<Item = Result<Bytes, Status>> {
+    stream::try_unfold((first, pieces), |(piece, mut pieces)| async move {
+        let Some(piece) = piece else { return Ok(None) };
+        let next = pieces.message().await?;
+        Ok(Some((piece.data, (next, pieces))))
+    })
+}
+
+/// Whether `If-None-Match` names this tag, also as a weak one: proxies that compress make tags weak.
+fn names(known: &HeaderValue, tag: &str) -> bool {
+    let known = known.to_str().unwrap_or_default().split(',').map(str::trim);
+    known.into_iter().any(|known| known == "*" || known.trim_start_matches("W/") == tag)
 }
 
 async fn find(web: &Web, caller: &Caller, job_id: &str, path: &str) -> Result<v1::BlobRef, Fault> {

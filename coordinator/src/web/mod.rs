@@ -104,13 +104,14 @@ fn router(web: Web) -> Router {
     }
     let asks_for_tokens = web.guard.access.asks_for_tokens();
     router
-        .layer(from_fn(guard_headers))
         .layer(from_fn(move |request, next| of_this_site(asks_for_tokens, request, next)))
+        // Outermost, so that refusals have them too.
+        .layer(from_fn(guard_headers))
         .with_state(web)
 }
 
 /// Refuses a request without a valid token before anything of its body is read.
-async fn with_token(State(web): State<Web>, request: Request, next: Next) -> Result<Response, Fault> {
+async fn with_token(State(web): State<Web>, mut request: Request, next: Next) -> Result<Response, Fault> {
     let visit = Visit::of(&request).cloned();
     let shown = request.headers().get(header::AUTHORIZATION).map(HeaderValue::to_str).transpose();
     let caller = match shown {
@@ -118,10 +119,11 @@ async fn with_token(State(web): State<Web>, request: Request, next: Next) -> Res
         Err(_) => Err(crate::access::Refused::NotValid),
     };
     match (caller, visit) {
-        (Ok(_), visit) => {
+        (Ok(caller), visit) => {
             if let Some(visit) = visit {
                 visit.admit();
             }
+            request.extensions_mut().insert(caller);
             Ok(next.run(request).await)
         }
         (Err(refused), visit) => {

@@ -9,7 +9,10 @@ use axum::http::{StatusCode, header};
 use serde::de::DeserializeOwned;
 use tonic::metadata::{Ascii, MetadataValue};
 
+use super::Web;
 use super::answer::Fault;
+use crate::access::Principal;
+use crate::access::places::Kind;
 use crate::connections::Visit;
 
 /// Largest body: the configuration of a job has at most 32 KiB.
@@ -44,14 +47,17 @@ impl<S: Send + Sync, T: DeserializeOwned> FromRequestParts<S> for Asked<T> {
 /// A body of JSON; no body means all defaults. Its type refuses unknown keys.
 pub struct Said<T>(pub T);
 
-impl<S: Send + Sync, T: DeserializeOwned + Default> FromRequest<S> for Said<T> {
+impl<T: DeserializeOwned + Default> FromRequest<Web> for Said<T> {
     type Rejection = Fault;
 
-    async fn from_request(request: Request, _: &S) -> Result<Self, Fault> {
+    async fn from_request(request: Request, web: &Web) -> Result<Self, Fault> {
         let is_json = request.headers().get(header::CONTENT_TYPE).is_some_and(|kind| {
             let kind = kind.to_str().unwrap_or_default().split(';').next().unwrap_or_default();
             kind.trim().eq_ignore_ascii_case("application/json")
         });
+        // What waits for its rest lies in memory, as a message of gRPC does. The layer before has the caller.
+        let caller = request.extensions().get::<Principal>().cloned().unwrap_or_else(Principal::anonymous);
+        let _place = web.guard.places.to_arrive(Kind::Request, &caller).await;
         let body = axum::body::to_bytes(request.into_body(), MAX_BODY_BYTES);
         let body = tokio::time::timeout(BODY_WITHIN, body).await.map_err(|_| {
             let seconds = BODY_WITHIN.as_secs();
@@ -62,10 +68,13 @@ impl<S: Send + Sync, T: DeserializeOwned + Default> FromRequest<S> for Said<T> {
             )
         })?;
         let body = body.map_err(|error| {
-            // Too long, or the connection broke; then nobody reads this.
-            let message =
-                format!("the body cannot be read, or has more than {MAX_BODY_BYTES} bytes: {error}");
-            Fault::with(StatusCode::PAYLOAD_TOO_LARGE, "TOO_LARGE", message)
+            let is_too_long = std::error::Error::source(&error)
+                .is_some_and(|why| why.is::<http_body_util::LengthLimitError>());
+            if is_too_long {
+                let message = format!("the body has more than {MAX_BODY_BYTES} bytes");
+                return Fault::with(StatusCode::PAYLOAD_TOO_LARGE, "TOO_LARGE", message);
+            }
+            Fault::bad(format!("the body cannot be read: {error}"))
         })?;
         if body.is_empty() {
             return Ok(Self(T::default()));

@@ -73,7 +73,7 @@ pub fn kind_of(path: &str) -> &'static str {
         "json" => "application/json",
         "png" => "image/png",
         "jpg" | "jpeg" => "image/jpeg",
-        "tif" | "tiff" => "image/tiff",
+        "webp" => "image/webp",
         _ => "application/octet-stream",
     }
 }

@@ -13,6 +13,8 @@ use http::header::{self, HeaderMap, HeaderName};
 use http::uri::Authority;
 
 const FETCH_SITE: HeaderName = HeaderName::from_static("sec-fetch-site");
+const FETCH_MODE: HeaderName = HeaderName::from_static("sec-fetch-mode");
+const FETCH_DEST: HeaderName = HeaderName::from_static("sec-fetch-dest");
 
 /// Why a request is refused.
 #[derive(Debug, thiserror::Error)]
@@ -54,8 +56,11 @@ pub fn check(headers: &HeaderMap, named: Option<&Authority>, asks_for_tokens: bo
             return Err(Refused::OtherSite(message));
         }
     }
+    // A link to a page here may be on any other page. What it opens replaces that page, which learns nothing.
+    let is_link =
+        only(headers, &FETCH_MODE)? == Some("navigate") && only(headers, &FETCH_DEST)? == Some("document");
     match only(headers, &FETCH_SITE)? {
-        Some("cross-site" | "same-site") => {
+        Some("cross-site" | "same-site") if !is_link => {
             Err(Refused::OtherSite("another website made this request".to_owned()))
         }
         _ => Ok(()),
@@ -128,6 +133,17 @@ mod tests {
         let of = |site| passes(true, &[(&header::HOST, "a.example"), (&FETCH_SITE, site)]);
         assert!(of("same-origin") && of("none"));
         assert!(!of("cross-site") && !of("same-site"));
+        let opened = |kind, more: &[(&HeaderName, &'static str)]| {
+            let link = [
+                (&header::HOST, "a.example"),
+                (&FETCH_SITE, "cross-site"),
+                (&FETCH_MODE, "navigate"),
+                (&FETCH_DEST, kind),
+            ];
+            passes(true, &[&link, more].concat())
+        };
+        assert!(opened("document", &[]), "a link on another page");
+        assert!(!opened("iframe", &[]) && !opened("document", &[(&header::ORIGIN, "http://b.example")]));
     }
 
     #[test]

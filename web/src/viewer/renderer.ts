@@ -43,7 +43,7 @@ import { type Pinhole, type Pose, worldToCamera } from './camera.ts';
 import { ViewerError } from './errors.ts';
 import { FULL_VERTEX, Paint, RESOLVE_FRAGMENT, SPLAT_FRAGMENT, SPLAT_VERTEX, Shown } from './shaders.ts';
 import type { Sorted } from './sorter.ts';
-import { type Quat, type Vec3, dot, matOfQuat, quatInverse, quatMul, rotate } from './vector.ts';
+import { type Quat, type Vec3, dot, matOfQuat, quatMul, rotate } from './vector.ts';
 import { Composition, type WaterRecord, actsOnGaussians, blendsInLinearLight, compositionOf } from './water.ts';
 
 /** What one side of the divider shows. */
@@ -222,7 +222,7 @@ export class Renderer {
             resource,
             material,
             shader: this.#splatShader(material, false),
-            order: this.#indexTexture('order', PIXELFORMAT_R32U, width, height),
+            order: this.#texture('order', PIXELFORMAT_R32U, width, height),
             partitions: null,
             antialiased,
             count: 0,
@@ -239,7 +239,7 @@ export class Renderer {
     setPartitions(numbers: Uint8Array): void {
         const model = this.#loaded();
         const { x: width, y: height } = model.resource.textureDimensions;
-        const partitions = this.#indexTexture('partitions', PIXELFORMAT_R8U, width, height);
+        const partitions = this.#texture('partitions', PIXELFORMAT_R8U, width, height);
         (partitions.lock() as Uint8Array).set(numbers);
         partitions.unlock();
         this.#model = { ...model, partitions, shader: this.#splatShader(model.material, true) };
@@ -377,10 +377,6 @@ export class Renderer {
             minFilter: FILTER_NEAREST,
             magFilter: FILTER_NEAREST,
         });
-    }
-
-    #indexTexture(name: string, format: number, width: number, height: number): Texture {
-        return this.#texture(name, format, width, height);
     }
 
     #read(targets: RenderTarget, index: number, x: number, y: number): Promise<ArrayLike<number>> {
@@ -539,11 +535,6 @@ export class Renderer {
     /** A pose for the sorter, whose centres are in model axes. */
     poseForSorting(pose: Pose): Pose {
         return this.#inModel(pose);
-    }
-
-    /** A point of the model in scene axes. */
-    inScene(point: Vec3): Vec3 {
-        return rotate(quatInverse(this.#toModel), point);
     }
 }
 

@@ -7,7 +7,7 @@ const PATHS = ['/usr/bin/chromium-headless-shell', '/usr/bin/chromium', '/usr/bi
 const FLAGS = ['--no-sandbox', '--use-angle=swiftshader', '--enable-unsafe-swiftshader', '--ignore-gpu-blocklist'];
 
 export function browserPath(): string | null {
-    return process.env['CHROMIUM'] ?? PATHS.find((path) => existsSync(path)) ?? null;
+    return process.env['CHROMIUM'] || (PATHS.find((path) => existsSync(path)) ?? null);
 }
 
 export async function launch(flags: readonly string[] = FLAGS): Promise<Browser> {
