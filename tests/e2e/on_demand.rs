@@ -56,7 +56,7 @@ async fn worker_processes_come_from_zero_and_go_back_to_zero() {
     let (_coordinator, url) = Service::coordinator_with(&flags);
     let scaler = format!("http://{scaler}");
     assert_eq!(demand(&scaler).await, 0);
-    let submit = ["submit", &scene, "--coordinator", &url, "--partitions", "2x2", "--iterations", "40"];
+    let submit = ["submit", &scene, "--coordinator", &url, "--partitions", "2x2", "--iterations", "400"];
     let job = succeed(&[&submit[..], &["--max-gaussians", "2000"]].concat()).trim().to_owned();
     let show = || json(&["show", &job, "--coordinator", &url, "--json"]);
 
@@ -79,7 +79,8 @@ async fn worker_processes_come_from_zero_and_go_back_to_zero() {
         if show()["state"] == "succeeded" && workers.is_empty() {
             break;
         }
-        tokio::time::sleep(Duration::from_millis(500)).await;
+        // Shorter than a partition takes, so that several are waiting when this looks.
+        tokio::time::sleep(Duration::from_millis(100)).await;
     }
     assert_eq!((demand(&scaler).await, most), (0, 3));
     assert!(started <= 4, "{started} workers for 4 partitions, at most 3 at a time");
