@@ -2,8 +2,10 @@
 # The pages for browsers (web/): builds them, checks them, and runs them in a browser.
 #
 #     scripts/web.sh build      web/dist from web/src
-#     scripts/web.sh check      types, lints, unit tests; and that the sources give the committed web/dist
-#     scripts/web.sh headless   the built pages in Chromium beside `fathom render` (quick: two small models)
+#     scripts/web.sh check      types, lints, unit tests; that the protos give the committed web/src/rpc, and
+#                               the sources the committed web/dist
+#     scripts/web.sh headless   the built pages in Chromium beside `fathom render` (quick: two small models),
+#                               and before a coordinator and a worker
 #
 # Needs npm and its registry. The packages, with Node as the package `node`, are those of
 # web/package-lock.json; Chromium is that of the system. Exits with 3 where npm or Chromium is missing, so
@@ -40,6 +42,7 @@ packages() {
 # all that contains it again.
 build_into() {
     vite build --logLevel warn --emptyOutDir --outDir "$1"
+    vite build --logLevel warn --config vite.handover.config.ts --outDir "$1" --emptyOutDir false
     node scripts/compress.mjs "$1"
 }
 
@@ -93,10 +96,10 @@ case "${1:-}" in
             tail -n 20 "$data/log" >&2
             exit 1
         }
-        VIEWER_DATA=$data npm run --silent headless
+        FATHOM=$fathom VIEWER_DATA=$data npm run --silent headless
         ;;
     *)
-        sed -n '2,13p' "$self" | sed 's/^# \{0,1\}//'
+        sed -n '2,15p' "$self" | sed 's/^# \{0,1\}//'
         exit 2
         ;;
 esac

@@ -17,6 +17,8 @@ use crate::error::{CliError, Result};
 pub const STOP_WITH_PARENT: &str = "--stop-with-stdin";
 /// The coordinator prints this before its URL when it is ready.
 pub const LISTENING: &str = "listening on ";
+/// The coordinator prints this before the link to its page, if it serves one.
+pub const PAGE: &str = "page on ";
 /// Opening a store and binding a port takes well under a second; repairing a store takes longer.
 const START_PATIENCE: Duration = Duration::from_secs(60);
 /// Heartbeats within one machine are seconds late at most. After all processes were killed, a resumed run
@@ -26,7 +28,7 @@ const LEASE_MS: &str = "10000";
 const CAPACITY_TIMEOUT_MS: &str = "3000";
 /// Environment variables that configure a user's own service. They are removed, because children only talk to
 /// each other on this machine.
-const NOT_FOR_CHILDREN: [&str; 12] = [
+const NOT_FOR_CHILDREN: [&str; 13] = [
     "FATHOM_CONFIG",
     "FATHOM_WORKER_CONFIG",
     "FATHOM_TOKENS",
@@ -39,6 +41,7 @@ const NOT_FOR_CHILDREN: [&str; 12] = [
     "FATHOM_TLS_CERT",
     "FATHOM_TLS_KEY",
     "FATHOM_CALLS_PER_SECOND",
+    "FATHOM_WEB",
 ];
 /// Maximum number of restarts of a dead worker.
 const RESTARTS: u32 = 3;
@@ -57,11 +60,19 @@ pub struct Children {
     coordinator: Process,
     workers: Vec<Process>,
     pub url: String,
+    /// The link to the page that shows the job, if asked for. It contains a token.
+    pub page: Option<String>,
 }
 
 impl Children {
-    /// Starts a coordinator on a free loopback port and a worker for each entry of `worker_arguments`.
-    pub async fn start(data_dir: &Path, logs: &Path, worker_arguments: &[Vec<String>]) -> Result<Self> {
+    /// Starts a coordinator on a free loopback port, with a page if asked for, and a worker for each entry of
+    /// `worker_arguments`.
+    pub async fn start(
+        data_dir: &Path,
+        logs: &Path,
+        worker_arguments: &[Vec<String>],
+        with_page: bool,
+    ) -> Result<Self> {
         std::fs::create_dir_all(logs).map_err(CliError::io("create", logs))?;
         let arguments = [
             "coordinator",
@@ -74,16 +85,20 @@ impl Children {
             "--data-dir",
         ]
         .map(str::to_owned);
-        let arguments = arguments.into_iter().chain([data_dir.to_string_lossy().into_owned()]).collect();
+        let mut arguments: Vec<_> =
+            arguments.into_iter().chain([data_dir.to_string_lossy().into_owned()]).collect();
+        if with_page {
+            arguments.extend(["--web", "127.0.0.1:0", "--own-page"].map(str::to_owned));
+        }
         let mut coordinator = Process::start("coordinator".to_owned(), arguments, logs)?;
-        let url = coordinator.wait_for_url().await?;
+        let (url, page) = coordinator.wait_for_url().await?;
         let mut workers = Vec::new();
         for (index, extra) in worker_arguments.iter().enumerate() {
             let mut arguments = vec!["worker".to_owned(), "--coordinator".to_owned(), url.clone()];
             arguments.extend(extra.iter().cloned());
             workers.push(Process::start(format!("worker-{index}"), arguments, logs)?);
         }
-        Ok(Self { coordinator, workers, url })
+        Ok(Self { coordinator, workers, url, page })
     }
 
     /// Waits until a process dies that cannot be replaced; workers are restarted a few times.
@@ -132,12 +147,17 @@ impl Process {
         Ok(())
     }
 
-    async fn wait_for_url(&mut self) -> Result<String> {
+    /// The URL of a coordinator, and the link to its page.
+    async fn wait_for_url(&mut self) -> Result<(String, Option<String>)> {
         let stdout: ChildStdout =
             self.child.stdout.take().ok_or_else(|| self.ended("has no output".to_owned()))?;
         let mut lines = BufReader::new(stdout).lines();
+        let mut page = None;
         let found = tokio::time::timeout(START_PATIENCE, async {
             while let Ok(Some(line)) = lines.next_line().await {
+                if let Some(link) = line.strip_prefix(PAGE) {
+                    page = Some(link.trim().to_owned());
+                }
                 if let Some(url) = line.strip_prefix(LISTENING) {
                     return Some(url.trim().to_owned());
                 }
@@ -146,7 +166,7 @@ impl Process {
         })
         .await;
         match found {
-            Ok(Some(url)) => Ok(url),
+            Ok(Some(url)) => Ok((url, page)),
             Ok(None) => Err(self.ended("ended before it was ready".to_owned())),
             Err(_) => Err(self.ended(format!("was not ready after {} s", START_PATIENCE.as_secs()))),
         }

@@ -15,6 +15,7 @@ mod error;
 mod eval_summary;
 #[cfg(test)]
 mod fuzz;
+mod handover;
 mod maps;
 mod model;
 mod open_water;
@@ -25,6 +26,7 @@ mod seams;
 mod settings;
 mod upload;
 mod verbs;
+mod viewed;
 mod white_point;
 
 use std::process::ExitCode;

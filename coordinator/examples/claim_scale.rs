@@ -155,7 +155,8 @@ async fn renewals(claimers: Vec<Client>, leases: Vec<(usize, v1::Lease)>) -> Res
             let mut took = Vec::new();
             for lease in leases {
                 let progress = Progress { iteration: 1, iterations: 1000, ..Default::default() };
-                let renewal = v1::Renewal { lease: Some(lease), progress: Some(progress) };
+                let renewal =
+                    v1::Renewal { lease: Some(lease), progress: Some(progress), ..Default::default() };
                 let request =
                     v1::RenewRequest { incarnation: incarnation_of(number), renewals: vec![renewal] };
                 let begin = Instant::now();

@@ -217,7 +217,11 @@ async fn heartbeats(url: &str, workers: usize, waiting: usize, seconds: u64) -> 
             loop {
                 iteration += 15;
                 let progress = Progress { iteration, iterations: 1000, ..Default::default() };
-                let renewal = v1::Renewal { lease: Some(lease.clone()), progress: Some(progress) };
+                let renewal = v1::Renewal {
+                    lease: Some(lease.clone()),
+                    progress: Some(progress),
+                    ..Default::default()
+                };
                 let request =
                     v1::RenewRequest { incarnation: incarnation_of(number), renewals: vec![renewal] };
                 let answer = client.renew(request).await?.into_inner();

@@ -38,6 +38,11 @@ pub struct CoordinatorConfig {
     /// Where to serve the HTTP interface, with the TLS and the tokens of this coordinator, which it needs
     /// beyond this machine; port 0 takes a free one. Default: nowhere.
     pub web: Option<SocketAddr>,
+    /// Whether `web` requires a token that is made for this process, although `tokens` is false: the page of
+    /// `fathom train` is for the one who started it. See [`crate::Coordinator::page_token`]. No setting of a
+    /// file.
+    #[serde(skip)]
+    pub own_page: bool,
     /// Where to serve KEDA, which starts workers by the number of tasks; port 0 takes a free one. Beyond this
     /// machine it needs `tls_cert`, `tls_key` and `scaler_client_ca`. Default: nowhere.
     pub scaler_listen: Option<SocketAddr>,
@@ -114,6 +119,7 @@ impl Default for CoordinatorConfig {
             listen: SocketAddr::from((Ipv4Addr::LOCALHOST, 7420)),
             metrics_listen: None,
             web: None,
+            own_page: false,
             scaler_listen: None,
             scaler_client_ca: None,
             lease_ms: 60_000,

@@ -3,10 +3,11 @@
 //!
 //! States are words, times are seconds since 1970 or RFC 3339, and a value that is not known is `null`.
 
-use fathom_proto::admin::v1::{Tenant, Worker, WorkerState};
+use fathom_proto::admin::v1::{Caller, Role, Tenant, Worker, WorkerState};
 use fathom_proto::v1::job_event::Event;
 use fathom_proto::v1::{
-    Dataset, DatasetState, Job, JobEvent, JobState, LogEntry, LogSeverity, Stage, Task, TaskState,
+    Dataset, DatasetState, HeldOutMetrics, HistoryPoint, Job, JobEvent, JobState, LogEntry, LogSeverity,
+    Preview, Stage, Task, TaskHistory, TaskState,
 };
 use prost_types::Timestamp;
 use serde_json::{Value, json};
@@ -125,9 +126,7 @@ pub fn event(of: &JobEvent) -> Option<Value> {
             "iterations": update.progress.map_or(0, |p| p.iterations),
             "gaussians": update.progress.map_or(0, |p| p.gaussians),
             "loss": update.progress.map(|p| p.loss),
-            "held_out": update.progress.and_then(|p| p.held_out).map(|m| json!({
-                "iteration": m.iteration, "psnr": m.psnr_db, "ssim": m.ssim, "views": m.views,
-            })),
+            "held_out": update.progress.and_then(|p| p.held_out).as_ref().map(held_out),
             "job_progress": update.job_progress,
         }),
         Event::Checkpoint(checkpoint) => json!({
@@ -146,6 +145,62 @@ pub fn event(of: &JobEvent) -> Option<Value> {
     value["job"] = of.job_id.clone().into();
     value["seq"] = of.seq.into();
     Some(value)
+}
+
+/// The curves of a task.
+pub fn task_history(of: &TaskHistory) -> Value {
+    let point = |point: &HistoryPoint| {
+        let progress = point.progress.unwrap_or_default();
+        json!({
+            "unix_seconds": unix_seconds(&point.time),
+            "attempt": point.attempt,
+            "iteration": progress.iteration,
+            "iterations": progress.iterations,
+            "gaussians": progress.gaussians,
+            "loss": progress.loss,
+            "iterations_per_second": progress.iterations_per_second,
+            "memory_bytes": (progress.memory_bytes > 0).then_some(progress.memory_bytes),
+            "held_out": progress.held_out.as_ref().map(held_out),
+        })
+    };
+    let preview = |of: &Preview| {
+        json!({
+            "view": of.view,
+            "iteration": of.iteration,
+            "render": of.render.as_ref().map(|blob| &blob.digest),
+            "clear": of.clear.as_ref().map(|blob| &blob.digest),
+        })
+    };
+    json!({
+        "task": of.task_id,
+        "points": of.points.iter().map(point).collect::<Vec<_>>(),
+        "previews": of.previews.iter().map(preview).collect::<Vec<_>>(),
+    })
+}
+
+fn held_out(of: &HeldOutMetrics) -> Value {
+    json!({"iteration": of.iteration, "psnr": of.psnr_db, "ssim": of.ssim, "views": of.views})
+}
+
+/// The caller of a service.
+pub fn caller(of: &Caller) -> Value {
+    let text = |text: &str| (!text.is_empty()).then(|| text.to_owned());
+    let role = match of.role() {
+        Role::Unspecified => "unknown",
+        Role::Viewer => "viewer",
+        Role::Submitter => "submitter",
+        Role::Operator => "operator",
+        Role::Worker => "worker",
+    };
+    json!({
+        "name": of.name,
+        "role": role,
+        "tenant": text(&of.tenant),
+        "job": text(&of.job_id),
+        "expires_unix_seconds": unix_seconds(&of.expire_time),
+        "tokens_required": of.tokens_required,
+        "version": of.build_version,
+    })
 }
 
 /// The state of a worker, in a word.

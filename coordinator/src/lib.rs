@@ -16,6 +16,7 @@ pub mod datasets;
 mod error;
 #[cfg(test)]
 mod fuzz;
+mod history;
 pub mod json;
 mod logs;
 pub mod maintenance;

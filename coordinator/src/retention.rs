@@ -92,6 +92,7 @@ pub async fn collect(shared: &State, policy: Policy) -> Result<Removed, Retentio
     let forgotten = forget_jobs(shared, policy.jobs).await?;
     forget_logs(shared).await?;
     forget_marks(shared).await?;
+    forget_links(shared).await?;
     forget_uploads(shared, policy.uploads).await?;
     // Blobs that are used from now on are young, so no new reference can name a blob that this round removes.
     let before = shared.clock.system_time().checked_sub(policy.unused).unwrap_or(SystemTime::UNIX_EPOCH);
@@ -141,6 +142,20 @@ async fn forget_logs(shared: &State) -> Result<(), RetentionError> {
             Ok(_) => {}
             Err(StoreError::JobNotFound(_)) => logs::forget(shared, &job).await,
             Err(error) => return Err(error.into()),
+        }
+    }
+    Ok(())
+}
+
+/// Deletes the tokens of links that ended a week ago. Until then they are listed as others are.
+async fn forget_links(shared: &State) -> Result<(), StoreError> {
+    const LISTED: Duration = Duration::from_secs(7 * 24 * 3600);
+    let listed_ms = u64::try_from(LISTED.as_millis()).unwrap_or(u64::MAX);
+    let before_ms = shared.clock.now_ms().saturating_sub(listed_ms);
+    for token in shared.store.tokens().await? {
+        if token.is_link_ended_before(before_ms) {
+            shared.store.forget_token(&token.id).await?;
+            shared.access.forget(&token.id);
         }
     }
     Ok(())

@@ -25,13 +25,14 @@ use tower_layer::Layer;
 use crate::access::calls::OpenCalls;
 use crate::access::guard::{Guard, GuardLayer};
 use crate::access::places::Places;
-use crate::access::{Access, RateLimit, ensure_operator};
+use crate::access::{Access, RateLimit, Role, Token, TokenRecord, ensure_operator};
 use crate::clock::Clock;
 use crate::company::keep_in_touch;
 use crate::config::CoordinatorConfig;
 use crate::connections::{Accepted, Connections, Room, accepted};
 use crate::data_dir;
 use crate::error::CoordinatorError;
+use crate::history;
 use crate::metrics::Metrics;
 use crate::metrics::endpoint::Endpoint;
 use crate::metrics::rpc::RpcLayer;
@@ -71,6 +72,7 @@ pub struct Coordinator {
     scheme: &'static str,
     metrics_address: Option<SocketAddr>,
     web_address: Option<SocketAddr>,
+    page_token: Option<Token>,
     scaler_address: Option<SocketAddr>,
     stopping: watch::Sender<bool>,
     running: JoinHandle<Result<(), CoordinatorError>>,
@@ -97,6 +99,12 @@ impl Coordinator {
     /// The address of the HTTP interface, if served.
     pub fn web_address(&self) -> Option<SocketAddr> {
         self.web_address
+    }
+
+    /// The token that the HTTP interface requires although other calls need none
+    /// ([`CoordinatorConfig::own_page`]).
+    pub fn page_token(&self) -> Option<String> {
+        self.page_token.as_ref().map(Token::reveal)
     }
 
     /// The address of the scaler, if served.
@@ -295,8 +303,8 @@ where
         Arc::new(Access::open())
     };
     let members = Arc::new(AtomicU32::new(1));
-    let guard = Guard {
-        access: Arc::clone(&access),
+    let guarded_by = |access: &Arc<Access>| Guard {
+        access: Arc::clone(access),
         rate: RateLimit::new(config.calls_per_second, Arc::clone(&members)),
         workers_show_certificates: config.client_ca.is_some(),
         clock,
@@ -304,9 +312,23 @@ where
         calls: Arc::new(OpenCalls::default()),
         refused: RateLimitedLog::default(),
     };
+    let guard = guarded_by(&access);
     let connections = Connections::new(room);
 
     let (stopping, stop_signal) = watch::channel(false);
+    let own_page = (config.own_page && !config.tokens).then(|| access_to_own_page(clock.now_ms()));
+    let (page_token, page_guard) =
+        own_page.map(|(token, access)| (token, GuardLayer(Arc::new(guarded_by(&access))))).unzip();
+    if let Some(GuardLayer(guard)) = &page_guard {
+        let (calls, access, mut ends) =
+            (Arc::clone(&guard.calls), Arc::clone(&guard.access), stop_signal.clone());
+        tokio::spawn(async move {
+            tokio::select! {
+                () = stopped(&mut ends) => {}
+                () = calls.watch(access, clock) => {}
+            }
+        });
+    }
     let metrics = Arc::new(Metrics::default());
     let shared = Arc::new(State {
         logs: crate::logs::of(store.as_ref(), &config.data_dir, config.attempt_log_bytes),
@@ -315,6 +337,8 @@ where
         objects,
         access,
         own_lines: Arc::default(),
+        history: Default::default(),
+        links: Default::default(),
         metrics,
         clock,
         lease_ms: config.lease_ms,
@@ -359,7 +383,9 @@ where
     let web = for_web.map(|((listener, address), tls)| {
         tracing::info!(%address, with_tls = tls.is_some(), "serving the HTTP interface");
         let shared = Arc::clone(&shared);
-        serve_web(shared, guard.clone(), tls, Arc::clone(&connections).of(accepted(listener)))
+        let is_own_page = page_guard.is_some();
+        let guard = page_guard.unwrap_or_else(|| guard.clone());
+        serve_web(shared, guard, is_own_page, tls, Arc::clone(&connections).of(accepted(listener)))
     });
     let incoming = Arc::clone(&connections).of(incoming);
     let running = match tls {
@@ -374,6 +400,7 @@ where
         address,
         metrics_address,
         web_address,
+        page_token,
         scaler_address,
         scheme,
         stopping,
@@ -381,6 +408,13 @@ where
         connections,
         shared,
     })
+}
+
+/// A token for the one who starts this process, and what requires it. It is stored nowhere.
+fn access_to_own_page(now_ms: u64) -> (Token, Arc<Access>) {
+    let token = Token::random();
+    let record = TokenRecord::new(&token, "page".to_owned(), Role::Operator, None, now_ms, None);
+    (token, Arc::new(Access::by_tokens(vec![record])))
 }
 
 /// Checks the files of TLS until the coordinator stops.
@@ -395,8 +429,13 @@ fn keep_fresh(tls: &Arc<Tls>, shared: &State) {
 }
 
 /// Serves the HTTP interface until the coordinator stops.
-async fn serve_web<I, C>(shared: Arc<State>, guard: GuardLayer, tls: Option<Arc<Tls>>, incoming: I)
-where
+async fn serve_web<I, C>(
+    shared: Arc<State>,
+    guard: GuardLayer,
+    is_own_page: bool,
+    tls: Option<Arc<Tls>>,
+    incoming: I,
+) where
     I: Stream<Item = io::Result<C>> + Send + 'static,
     C: AsyncRead + AsyncWrite + Connected + Unpin + Send + 'static,
 {
@@ -404,10 +443,10 @@ where
     let mut stopping = shared.stopping.clone();
     let stops = async move { stopped(&mut stopping).await };
     let served = match tls {
-        None => web::serve(incoming, door, guard.0, stops).await,
+        None => web::serve(incoming, door, guard.0, is_own_page, stops).await,
         Some(tls) => {
             keep_fresh(&tls, &shared);
-            web::serve(tls.over(incoming), door, guard.0, stops).await
+            web::serve(tls.over(incoming), door, guard.0, is_own_page, stops).await
         }
     };
     if let Err(error) = served {
@@ -467,7 +506,11 @@ where
                 .max_decoding_message_size(MAX_MESSAGE_BYTES),
         )
         .serve_with_incoming_shutdown(incoming, async move { stopped(&mut stopping).await });
-    let own_tasks = run_own_tasks(Arc::clone(&shared));
+    let (with_tasks, with_history, at_the_end) =
+        (Arc::clone(&shared), Arc::clone(&shared), Arc::clone(&shared));
+    let own_tasks = async {
+        tokio::join!(run_own_tasks(with_tasks), history::store(with_history));
+    };
     let house = collect_garbage(Arc::clone(&shared), look_every);
     let disowned = release_disowned(Arc::clone(&shared));
     let sweeper = sweep_leases(shared);
@@ -500,6 +543,8 @@ where
                     }
                 };
                 tokio::join!(own_tasks, web);
+                // Results that arrived meanwhile have brought the last points of their tasks.
+                let _ = tokio::time::timeout(STOP_WITHIN / 5, history::store_waiting(&at_the_end)).await;
                 return served.map_err(|e| CoordinatorError::Server(e.to_string()));
             }
             swept = &mut sweeper, if sweeper_runs => {

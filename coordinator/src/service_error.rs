@@ -84,6 +84,9 @@ pub enum ServiceError {
         /// Whether it belongs to one tenant.
         of_tenant: bool,
     },
+    /// The guest of a link, with a call that links may not make.
+    #[error("this token is that of a link: it reads one job, and nothing else")]
+    OfLink,
     /// A worker without a certificate.
     #[error(
         "this coordinator accepts only workers with a certificate: start the worker with --tls-cert FILE and --tls-key FILE"
@@ -101,6 +104,17 @@ pub enum ServiceError {
          ones are then made with `fathom token issue --data-dir DIR` while the coordinator is stopped"
     )]
     LastOperator(String),
+    /// A tenant that makes too many links.
+    #[error(
+        "{tenant} has made {most} links in a day, the most that it may; wait a day, or ask an operator for the token of \
+         a viewer"
+    )]
+    TooManyLinks {
+        /// The tenant.
+        tenant: Tenant,
+        /// Links in a day.
+        most: usize,
+    },
     /// A tenant that has reached its limit of bytes.
     #[error(
         "{tenant} uses {used_bytes} of {limit_bytes} bytes; delete jobs that are not needed, or ask an operator for more"
@@ -238,12 +252,16 @@ impl From<ServiceError> for Status {
             }
             ServiceError::Token(Refused::Missing) => (Code::Unauthenticated, "TOKEN_MISSING"),
             ServiceError::Token(Refused::NotValid) => (Code::Unauthenticated, "TOKEN_REFUSED"),
-            ServiceError::RoleRefused { .. } => (Code::PermissionDenied, "ROLE_REFUSED"),
+            ServiceError::RoleRefused { .. } | ServiceError::OfLink => {
+                (Code::PermissionDenied, "ROLE_REFUSED")
+            }
             ServiceError::NoCertificate => (Code::Unauthenticated, "CERTIFICATE_MISSING"),
             ServiceError::TooManyCalls(_) => (Code::ResourceExhausted, "RATE_LIMITED"),
             ServiceError::NoSuchToken(_) => (Code::NotFound, "TOKEN_NOT_FOUND"),
             ServiceError::LastOperator(_) => (Code::FailedPrecondition, "LAST_OPERATOR"),
-            ServiceError::TooManyBytes { .. } => (Code::ResourceExhausted, "QUOTA_SPENT"),
+            ServiceError::TooManyBytes { .. } | ServiceError::TooManyLinks { .. } => {
+                (Code::ResourceExhausted, "QUOTA_SPENT")
+            }
             ServiceError::Store(error) => match error {
                 StoreError::JobNotFound(_) => (Code::NotFound, "JOB_NOT_FOUND"),
                 StoreError::RequestIdReused { .. } => (Code::AlreadyExists, "REQUEST_ID_REUSED"),

@@ -10,12 +10,14 @@ use tokio::sync::watch;
 use crate::access::{Access, Principal};
 use crate::capacity::Gap;
 use crate::clock::Clock;
+use crate::history::Waiting;
 use crate::logs::Logs;
 use crate::metrics::Metrics;
 use crate::objects::TenantBlobs;
 use crate::retention::Policy;
 use crate::schedule::{JobId, Lease, Tenant};
 use crate::service_error::ServiceError;
+use crate::services::links::Links;
 use crate::store::{JobStore, Store, StoreError};
 use crate::wakeups::Wakeups;
 use crate::worker_registry::WorkerRegistry;
@@ -34,6 +36,10 @@ pub struct State {
     pub logs: Arc<dyn Logs>,
     /// Log lines of the coordinator's own tasks on their way there.
     pub own_lines: Arc<Queue<Lease>>,
+    /// Points of curves on their way there.
+    pub history: Waiting,
+    /// Links to jobs.
+    pub links: Links,
     /// Metrics.
     pub metrics: Arc<Metrics>,
     /// The one clock.
@@ -63,6 +69,9 @@ pub struct State {
 impl State {
     /// The tenant of a job, if the caller may see it: objects of other tenants do not exist for the caller.
     pub async fn owner(&self, caller: &Principal, job: &JobId) -> Result<Tenant, StoreError> {
+        if !caller.sees_job(job) {
+            return Err(StoreError::JobNotFound(job.clone()));
+        }
         let tenant = self.jobs.job_row(job).await?.tenant;
         if caller.sees(&tenant) { Ok(tenant) } else { Err(StoreError::JobNotFound(job.clone())) }
     }

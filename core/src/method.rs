@@ -8,7 +8,8 @@ use std::sync::Arc;
 use crate::Result;
 use crate::gaussians::Gaussians;
 use crate::gpu::Gpu;
-use crate::train::{HeldOutMetrics, Progress, TrainRun, Trainer};
+use crate::scene::{PinholeCamera, Pose};
+use crate::train::{HeldOutMetrics, Preview, Progress, TrainRun, Trainer};
 use crate::views::ViewSource;
 use crate::water::WaterRecord;
 
@@ -59,6 +60,17 @@ pub trait Run {
         go_on: &dyn Fn() -> bool,
     ) -> Result<Option<HeldOutMetrics>>;
 
+    /// Small pictures of what the run sees now, with the first of these cameras, as long as `go_on`, which is
+    /// called before each picture, returns true. They change nothing.
+    ///
+    /// # Errors
+    /// When the device fails, or has no memory for them.
+    fn preview(
+        &mut self,
+        cameras: &[(PinholeCamera, Pose)],
+        go_on: &dyn Fn() -> bool,
+    ) -> Result<Vec<Preview>>;
+
     /// What the run has trained so far; a `metres_per_unit` of 0 means unknown.
     ///
     /// # Errors
@@ -99,6 +111,14 @@ impl Run for Trainer {
         go_on: &dyn Fn() -> bool,
     ) -> Result<Option<HeldOutMetrics>> {
         self.measure(held_out, go_on)
+    }
+
+    fn preview(
+        &mut self,
+        cameras: &[(PinholeCamera, Pose)],
+        go_on: &dyn Fn() -> bool,
+    ) -> Result<Vec<Preview>> {
+        self.preview(cameras, go_on)
     }
 
     fn hand_in(&mut self, metres_per_unit: f64) -> Result<Trained> {

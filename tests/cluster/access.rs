@@ -245,7 +245,7 @@ async fn a_tenants_worker_gets_and_ends_no_lease_of_another_tenant() {
     let release = worker_v1::ReleaseRequest { lease: Some(lease.clone()), reason: String::new() };
     let absent = is(Code::NotFound, "JOB_NOT_FOUND");
     assert_eq!(said(own.workers().release(release).await), absent);
-    let renewal = worker_v1::Renewal { lease: Some(lease), progress: None };
+    let renewal = worker_v1::Renewal { lease: Some(lease), ..Default::default() };
     let renew = worker_v1::RenewRequest { incarnation: INCARNATION.into(), renewals: vec![renewal] };
     assert_eq!(said(own.workers().renew(renew).await), absent);
     let claim =

@@ -10,9 +10,11 @@ mod blobs;
 #[path = "../support/callers.rs"]
 mod callers;
 mod datasets;
+mod history;
 mod hostile;
 mod jobs;
 mod leaving;
+mod links;
 mod memory;
 #[path = "../support/postgres.rs"]
 mod postgres;

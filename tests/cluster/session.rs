@@ -84,7 +84,7 @@ async fn a_session_answers_renewals_and_pushes_lease_outcomes() {
     let (renewals, receiver) = mpsc::channel(4);
     let mut answers = worker.session(ReceiverStream::new(receiver)).await.unwrap().into_inner();
     let renew = async |incarnation: &str| {
-        let renewals_of = vec![worker_v1::Renewal { lease: lease.clone(), progress: None }];
+        let renewals_of = vec![worker_v1::Renewal { lease: lease.clone(), ..Default::default() }];
         let renewal = worker_v1::RenewRequest { incarnation: incarnation.into(), renewals: renewals_of };
         renewals.send(worker_v1::SessionRequest { renewal: Some(renewal) }).await.unwrap();
     };

@@ -282,8 +282,10 @@ async fn wrong_requests_are_answered_with_what_is_wrong() {
     assert_eq!(reason(&http.say(Method::PUT, "/jobs", Value::Null).await), (405, "METHOD_NOT_ALLOWED"));
     let events = http.request(Method::GET, &format!("/jobs/{job}/events")).header("last-event-id", "first");
     assert_eq!(answer_of(events).await, (400, "BAD_ARGUMENT".into()));
-    let root = answer(http.client.get(format!("http://{}/", cluster.web_address()))).await;
-    assert_eq!(reason(&root), (404, "NOT_FOUND"));
+    for path in ["index.html", "assets/none.js", "assets/../view.html", "handover.html"] {
+        let beside = answer(http.client.get(format!("http://{}/{path}", cluster.web_address()))).await;
+        assert_eq!(reason(&beside), (404, "NOT_FOUND"), "{path}");
+    }
     let found = http.request(Method::GET, "/jobs").send().await.unwrap();
     assert_eq!(found.headers()["x-content-type-options"], "nosniff");
     assert_eq!(found.headers()["cache-control"], "no-store");

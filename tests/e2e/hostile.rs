@@ -121,6 +121,17 @@ impl JobService for Hostile {
         Err(Status::invalid_argument(EVIL))
     }
 
+    async fn get_history(&self, _: Request<v1::GetHistoryRequest>) -> Result<Response<v1::History>, Status> {
+        Err(Status::invalid_argument(EVIL))
+    }
+
+    async fn share_job(
+        &self,
+        _: Request<v1::ShareJobRequest>,
+    ) -> Result<Response<v1::ShareJobResponse>, Status> {
+        Err(Status::invalid_argument(EVIL))
+    }
+
     async fn delete_job(
         &self,
         _: Request<v1::DeleteJobRequest>,

@@ -12,12 +12,14 @@ mod drivers;
 mod faults;
 #[cfg(unix)]
 mod gpu_kit;
+mod handover;
 mod held_out;
 mod hostile;
 #[cfg(unix)]
 mod logs;
 #[cfg(unix)]
 mod on_demand;
+mod page;
 #[path = "../support/postgres.rs"]
 mod postgres;
 #[path = "../support/processes.rs"]

@@ -17,6 +17,19 @@ render() {
         -o "$data/renders/$name/$folder" "$@"
 }
 
+# A copy for viewing, and pages to hand over. The name and the credits try to be markup.
+handover() {
+    mkdir -p "$data/handover"
+    cp -r "$data/pixel" "$data/handover/<script>wreck & co"
+    "$fathom" export "$data/pixel" -o "$data/handover/model.compressed.ply"
+    "$fathom" export "$data/handover/<script>wreck & co" --html "$data/handover/page.html" \
+        --photographs "$data/wreck" \
+        --credits '</script><script>document.title = "taken"</script> Photographs: <b>us</b> & co. CC BY 4.0'
+    view='c%3D0%2C-2%2C0%2C-0.7071068%2C0%2C0%2C0.7071068%26f%3D50%26m%3Dwater%2Cnone%26s%3D0.5%26w%3D1'
+    "$fathom" export "$data/pixel" --html "$data/handover/views.html" \
+        --views "http://127.0.0.1:1/x/view.html#c=0,-3,0,-0.7071068,0,0,0.7071068&f=50&m=clear,none&s=0.5&w=1&b=Bow+%3C1%3E~$view"
+}
+
 if [ "${3:-}" = quick ]; then
     "$fathom" synth "$data/wreck" --views 16 --size 120x90
     set -- --allow-cpu --max-gaussians 3000 --iterations 150
@@ -27,6 +40,7 @@ if [ "${3:-}" = quick ]; then
         render "$name" water --water on
         render "$name" veil --water only
     done
+    handover
     exit
 fi
 
@@ -62,3 +76,4 @@ for name in pixel gaussian gaussian_linear maps open aligned over_black; do
     render "$name" water --water on
     render "$name" veil --water only
 done
+handover

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use fathom_observe::threads;
 use fathom_proto::dial::{Connection, Dial, reason};
-use fathom_proto::v1::Progress;
+use fathom_proto::v1::{Preview, Progress};
 use fathom_proto::worker::v1;
 use fathom_proto::worker::v1::worker_service_client::WorkerServiceClient;
 use tokio::sync::{Notify, mpsc, watch};
@@ -20,6 +20,10 @@ use crate::retry::is_sent_away;
 const FIRST_PERIOD: Duration = Duration::from_millis(250);
 /// Time limit of one renewal; then the next is tried.
 const CALL_WITHIN: Duration = Duration::from_secs(10);
+/// Points of curves that wait for the next renewal at most. With the previews, the coordinator reads 64.
+const MOST_MEASURED: usize = 60;
+/// Batches of previews that wait for it at most.
+const MOST_BATCHES: usize = 4;
 
 /// The reason why work stops early.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -38,6 +42,10 @@ pub enum Stop {
 struct PulseState {
     lease: Option<v1::Lease>,
     progress: Option<Progress>,
+    /// Points of the curves that have not been sent, each with its time.
+    measured: Vec<(Instant, Progress)>,
+    /// Batches of previews that have not been sent, each with the time of its upload.
+    previews: Vec<(Instant, Vec<Preview>)>,
     stop: Option<Stop>,
     renew_every: Option<Duration>,
 }
@@ -48,7 +56,7 @@ pub struct Pulse {
     state: Mutex<PulseState>,
     /// Notified when the work must stop.
     stopped: Notify,
-    /// Notified when there is a lease to renew.
+    /// Notified when there is a lease or something to show: the next renewal is due at once.
     begun: Notify,
 }
 
@@ -61,6 +69,8 @@ impl Pulse {
     pub fn begin(&self, lease: v1::Lease) {
         let mut state = self.lock();
         (state.lease, state.progress, state.stop) = (Some(lease), None, None);
+        state.measured.clear();
+        state.previews.clear();
         drop(state);
         self.begun.notify_one();
     }
@@ -69,11 +79,51 @@ impl Pulse {
     pub fn end(&self) {
         let mut state = self.lock();
         (state.lease, state.progress, state.stop) = (None, None, None);
+        state.measured.clear();
+        state.previews.clear();
     }
 
     /// Progress for the next renewal.
     pub fn report(&self, progress: Progress) {
-        self.lock().progress = Some(progress);
+        let mut state = self.lock();
+        state.progress = Some(progress);
+        if state.measured.len() >= MOST_MEASURED {
+            // Every other one: the coordinator does not answer, or training is much faster than renewals.
+            let mut place = 0;
+            state.measured.retain(|_| {
+                place += 1;
+                place % 2 == 1
+            });
+        }
+        state.measured.push((Instant::now(), progress));
+    }
+
+    /// Uploaded previews. They are rare, so they do not wait for the next renewal: one is sent at once.
+    pub fn show(&self, previews: Vec<Preview>) {
+        let mut state = self.lock();
+        if !previews.is_empty() && state.previews.len() < MOST_BATCHES {
+            state.previews.push((Instant::now(), previews));
+            drop(state);
+            self.begun.notify_one();
+        }
+    }
+
+    /// The points of the curves and the previews since the last call. Those of a message that is lost are
+    /// lost too: they only show how the training went.
+    pub fn take_measured(&self) -> Vec<v1::Measured> {
+        let mut state = self.lock();
+        let points = std::mem::take(&mut state.measured);
+        let previews = std::mem::take(&mut state.previews);
+        drop(state);
+        let points = points.into_iter().map(|(at, progress)| (at, Some(progress), Vec::new()));
+        // The point of a preview was sent when it was measured.
+        let previews = previews.into_iter().map(|(at, previews)| (at, None, previews));
+        let sent = points.chain(previews).map(|(at, progress, previews)| v1::Measured {
+            progress,
+            age_ms: u32::try_from(at.elapsed().as_millis()).unwrap_or(u32::MAX),
+            previews,
+        });
+        sent.collect()
     }
 
     /// The reason for the current work to stop, if any.
@@ -295,7 +345,11 @@ impl Renewals {
     ) -> Result<(), Status> {
         let request = v1::RenewRequest {
             incarnation: self.registration.incarnation.clone(),
-            renewals: vec![v1::Renewal { lease: Some(lease.clone()), progress }],
+            renewals: vec![v1::Renewal {
+                lease: Some(lease.clone()),
+                progress,
+                measured: pulse.take_measured(),
+            }],
         };
         if self.session.is_none() && self.tries_session && self.has_sessions {
             self.open(pulse.period()).await;

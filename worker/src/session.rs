@@ -9,6 +9,7 @@ use bytes::Bytes;
 use fathom_core::scene::BlobRef;
 use fathom_observe::{attempt_span, capture, threads};
 use fathom_proto::dial::{Connection, Dial, reason};
+use fathom_proto::v1::Preview;
 use fathom_proto::worker::v1;
 use fathom_proto::worker::v1::worker_service_client::WorkerServiceClient;
 use fathom_proto::{WORKER_PROTOCOL_VERSION, stage_name};
@@ -21,7 +22,7 @@ use uuid::Uuid;
 
 use crate::blobs::{BlobClient, BlobSource, to_proto};
 use crate::cache::{BlobCache, KEEP_EVERY};
-use crate::execute::{Executor, Stop, TaskError, TaskOutput};
+use crate::execute::{Executor, Picture, Stop, TaskError, TaskOutput};
 use crate::fetch::Fetch;
 use crate::heartbeat::{Heartbeat, Pulse};
 use crate::leaving::{SUBMIT_WITHIN, leave_deadline, stop_requested};
@@ -390,8 +391,10 @@ impl Session {
             pulse: Arc::clone(&self.pulse),
             blobs: self.blobs.of_job(&lease.job_id),
             runtime: Handle::current(),
-            mailbox: Mailbox::default(),
+            checkpoints: Mailbox::default(),
+            previews: Mailbox::default(),
             metrics: Arc::clone(&self.metrics),
+            executor: Arc::clone(&self.executor),
             reported: AtomicU32::new(assignment.checkpoint_iteration),
             gone: watch::Sender::new(false),
             stopping: self.stopping.clone(),
@@ -399,13 +402,15 @@ impl Session {
         // If this future is dropped (the task is abandoned or the worker ends), the thread must stop.
         let _guard = StopOnDrop(Arc::clone(&control));
         let mut thread = spawn_training(Arc::clone(&self.executor), input, Arc::clone(&control), seat);
-        let uploader = self.upload_checkpoints(lease, &control.mailbox);
-        tokio::pin!(uploader);
+        let checkpoints = self.upload_checkpoints(lease, &control.checkpoints);
+        let previews = self.upload_previews(lease, &control.previews);
+        tokio::pin!(checkpoints, previews);
         let result = loop {
             tokio::select! {
                 biased;
                 result = &mut thread => break result,
-                () = &mut uploader => unreachable!("the uploader has no end"),
+                () = &mut checkpoints => unreachable!("the uploader has no end"),
+                () = &mut previews => unreachable!("the uploader has no end"),
                 () = stop_requested(&mut stopping), if self.pulse.stop_reason().is_none() => {
                     self.pulse.stop(Stop::Leave);
                 }
@@ -436,7 +441,7 @@ impl Session {
     }
 
     /// Uploads and reports checkpoints as they arrive; a newer one replaces a waiting one.
-    async fn upload_checkpoints(&self, lease: &v1::Lease, mailbox: &Mailbox) {
+    async fn upload_checkpoints(&self, lease: &v1::Lease, mailbox: &Mailbox<(Bytes, u32)>) {
         loop {
             let (bytes, iteration) = mailbox.take().await;
             match self.report_checkpoint(lease, bytes, iteration).await {
@@ -444,6 +449,31 @@ impl Session {
                 Err(WorkerError::Refused(status)) if is_over(&status) => self.pulse.stop(Stop::Abandon),
                 Err(error) => tracing::warn!(%error, iteration, "a checkpoint was not accepted"),
             }
+        }
+    }
+
+    /// Uploads previews as they arrive and puts them into the next renewal. Some may be lost: they only show
+    /// how the training goes.
+    async fn upload_previews(&self, lease: &v1::Lease, mailbox: &Mailbox<(u32, Vec<Picture>)>) {
+        let blobs = self.blobs.of_job(&lease.job_id);
+        loop {
+            let (iteration, pictures) = mailbox.take().await;
+            let mut uploaded = Vec::with_capacity(pictures.len());
+            for Picture { view, render, clear } in pictures {
+                let send = async |jpeg: Bytes| blobs.upload(&BlobSource::Bytes(jpeg)).await.ok();
+                let Some(render) = send(render).await else { continue };
+                let clear = match clear {
+                    Some(clear) => send(clear).await,
+                    None => None,
+                };
+                uploaded.push(Preview {
+                    view,
+                    iteration,
+                    render: Some(to_proto(&render)),
+                    clear: clear.as_ref().map(to_proto),
+                });
+            }
+            self.pulse.show(uploaded);
         }
     }
 
@@ -487,6 +517,7 @@ impl Session {
                 adapter: self.registration.capabilities.clone().unwrap_or_default().adapter,
                 resumed_from_iteration: output.resumed_from,
                 held_out: output.held_out,
+                measured: self.pulse.take_measured(),
             }),
             further: output.further.iter().map(named).collect(),
         };

@@ -13,7 +13,7 @@ use tokio::sync::{Notify, OwnedMutexGuard, oneshot, watch};
 use tracing::Instrument;
 
 use crate::blobs::{BlobClient, BlobSource};
-use crate::execute::{Control, Executor, Stop, TaskError, TaskInput, TaskOutput};
+use crate::execute::{Control, Executor, Picture, Stop, TaskError, TaskInput, TaskOutput};
 use crate::heartbeat::Pulse;
 use crate::leaving::{SUBMIT_WITHIN, leave_deadline};
 use crate::metrics::GpuMetrics;
@@ -58,23 +58,28 @@ impl Drop for StopOnDrop {
     }
 }
 
-/// The checkpoint that waits for upload.
-#[derive(Default)]
-pub struct Mailbox {
-    waiting: Mutex<Option<(Bytes, u32)>>,
+/// The latest of what the training thread submits, until it is uploaded.
+pub struct Mailbox<T> {
+    waiting: Mutex<Option<T>>,
     arrived: Notify,
 }
 
-impl Mailbox {
-    fn put(&self, bytes: Bytes, iteration: u32) {
-        *self.waiting.lock().unwrap_or_else(PoisonError::into_inner) = Some((bytes, iteration));
+impl<T> Default for Mailbox<T> {
+    fn default() -> Self {
+        Self { waiting: Mutex::new(None), arrived: Notify::new() }
+    }
+}
+
+impl<T> Mailbox<T> {
+    fn put(&self, latest: T) {
+        *self.waiting.lock().unwrap_or_else(PoisonError::into_inner) = Some(latest);
         self.arrived.notify_one();
     }
 
-    pub async fn take(&self) -> (Bytes, u32) {
+    pub async fn take(&self) -> T {
         loop {
-            if let Some(checkpoint) = self.waiting.lock().unwrap_or_else(PoisonError::into_inner).take() {
-                return checkpoint;
+            if let Some(latest) = self.waiting.lock().unwrap_or_else(PoisonError::into_inner).take() {
+                return latest;
             }
             self.arrived.notified().await;
         }
@@ -86,8 +91,12 @@ pub struct TaskControl {
     pub pulse: Arc<Pulse>,
     pub blobs: BlobClient,
     pub runtime: Handle,
-    pub mailbox: Mailbox,
+    /// Checkpoints, each with its iteration.
+    pub checkpoints: Mailbox<(Bytes, u32)>,
+    /// Previews, each with their iteration.
+    pub previews: Mailbox<(u32, Vec<Picture>)>,
     pub metrics: Arc<GpuMetrics>,
+    pub executor: Arc<dyn Executor>,
     /// The last reported iteration.
     pub reported: AtomicU32,
     /// Whether this attempt was abandoned. The pulse soon serves the next task, and reports of this attempt
@@ -108,12 +117,17 @@ impl Control for TaskControl {
         if !self.is_gone() {
             let before = self.reported.swap(progress.iteration, Ordering::Relaxed);
             self.metrics.trained(before, &progress);
-            self.pulse.report(progress);
+            let memory_bytes = self.executor.memory().map_or(0, |memory| memory.allocated_bytes);
+            self.pulse.report(Progress { memory_bytes, ..progress });
         }
     }
 
     fn checkpoint(&self, bytes: Bytes, iteration: u32) {
-        self.mailbox.put(bytes, iteration);
+        self.checkpoints.put((bytes, iteration));
+    }
+
+    fn preview(&self, iteration: u32, pictures: Vec<Picture>) {
+        self.previews.put((iteration, pictures));
     }
 
     fn stop_reason(&self) -> Option<Stop> {

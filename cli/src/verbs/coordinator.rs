@@ -25,6 +25,9 @@ pub struct CoordinatorArgs {
     /// TOML file with these settings, under the names of the flags with _ for -; flags and environment win
     #[arg(long, value_name = "FILE", env = "FATHOM_CONFIG")]
     config: Option<PathBuf>,
+    /// Require a token for the HTTP interface, made for this process and printed with the address of the page
+    #[arg(long, hide = true)]
+    own_page: bool,
     /// Stop when standard input closes, so that a parent process never leaves it behind
     #[arg(long, hide = true)]
     stop_with_stdin: bool,
@@ -163,8 +166,13 @@ fn finite(text: &str) -> std::result::Result<f64, String> {
 
 pub async fn run(args: CoordinatorArgs) -> Result<()> {
     let config = args.settings.resolve(args.config.as_deref())?;
+    let config = CoordinatorConfig { own_page: args.own_page, ..config };
     let failed = |error: fathom_coordinator::CoordinatorError| CliError::Message(error.to_string());
     let coordinator = serve(config).await.map_err(failed)?;
+    if let (Some(address), Some(token)) = (coordinator.web_address(), coordinator.page_token()) {
+        let scheme = if coordinator.url().starts_with("https:") { "https" } else { "http" };
+        output::line(format!("{}{scheme}://{address}/#token={token}", children::PAGE));
+    }
     output::line(format!("{}{}", children::LISTENING, coordinator.url()));
     let parent_gone = args.stop_with_stdin.then(children::stdin_closes);
     let asked_to_stop = async {

@@ -1,9 +1,11 @@
 //! `fathom export`: writes a model for other programs. Its colours stay as they are, or are converted for
-//! viewers or to linear light; its axes are those of the scene or of its plan.
+//! viewers or to linear light; its axes are those of the scene or of its plan. With `--html` it writes a page
+//! ([`crate::handover`]).
 
 use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
+use fathom_core::CoreError;
 use fathom_core::axes;
 use fathom_core::config::DataConfig;
 use fathom_core::gaussians::Gaussians;
@@ -18,6 +20,7 @@ use fathom_core::white_point::{self as white, WhitePoint};
 use glam::DQuat;
 
 use crate::error::{CliError, Result};
+use crate::handover::{self, HandoverArgs};
 use crate::model::{self, GpuArgs};
 use crate::output;
 use crate::progress::{Progress, Unit};
@@ -52,12 +55,24 @@ enum Frame {
     Aligned,
 }
 
+/// Form of the exported model.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+enum Format {
+    /// Floats, as every program reads them
+    Ply,
+    /// The compressed PLY of PlayCanvas, for viewing: about a quarter of the bytes
+    CompressedPly,
+}
+
 /// Arguments of `fathom export`.
 #[derive(Args, Debug)]
 pub struct ExportArgs {
-    /// A result folder, or a PLY
+    /// A result folder, or a PLY; for --html also a .compressed.ply or a .sog
     #[arg(value_name = "OUT|MODEL.ply")]
     model: PathBuf,
+    /// Form of the exported model [default: compressed-ply if its name ends with .compressed.ply, else ply]
+    #[arg(long, value_name = "FORM")]
+    format: Option<Format>,
     /// Encoding of the exported colours
     #[arg(long = "export-colour", visible_alias = "colour", value_name = "LIGHT", default_value = "srgb")]
     colour: Colour,
@@ -76,18 +91,31 @@ pub struct ExportArgs {
     #[command(flatten)]
     gpu: GpuArgs,
     /// The file to write
-    #[arg(short, long, value_name = "FILE.ply")]
-    output: PathBuf,
+    #[arg(short, long, value_name = "FILE.ply", required_unless_present = "html")]
+    output: Option<PathBuf>,
+    #[command(flatten)]
+    handover: HandoverArgs,
 }
 
 pub fn run(args: ExportArgs) -> Result<()> {
+    args.handover.check()?;
+    match (&args.handover.html, &args.output) {
+        (Some(html), _) => handover::write(&args.model, html, &args.handover),
+        (None, Some(output)) => export(&args, output),
+        (None, None) => {
+            Err(CliError::Message("name the file to write with -o, or a page with --html".to_owned()))
+        }
+    }
+}
+
+fn export(args: &ExportArgs, to: &Path) -> Result<()> {
     let path = model::model_path(&args.model)?;
     model::refuse_linear(&path)?;
     let same = std::fs::canonicalize(&path).ok();
-    if same.is_some() && same == std::fs::canonicalize(&args.output).ok() {
+    if same.is_some() && same == std::fs::canonicalize(to).ok() {
         return Err(CliError::Message(format!(
             "{} is the model itself; give another output file with -o",
-            args.output.display()
+            to.display()
         )));
     }
     let compares = args.colour == Colour::Viewer;
@@ -100,9 +128,9 @@ pub fn run(args: ExportArgs) -> Result<()> {
                 .to_owned(),
         ));
     }
-    let white = white_point_of(&args, &path)?;
+    let white = white_point_of(args, &path)?;
     if compares {
-        return for_viewers(&args, &path, white.as_ref());
+        return for_viewers(args, to, &path, white.as_ref());
     }
     let mut reader = SplatReader::open(&path)?;
     let (count, layout) = (reader.count(), reader.layout());
@@ -119,26 +147,52 @@ pub fn run(args: ExportArgs) -> Result<()> {
     if let (Frame::Aligned, Some(rotation)) = (args.frame, rotation) {
         comments.push(axes::comment(rotation));
     }
-    write_whole(&args.output, |file| {
-        let name = args.output.to_string_lossy();
-        let mut writer = SplatWriter::new(file, &name, count, layout.sh_degree(), &comments)?;
-        while let Some(block) = reader.next_block(BLOCK)? {
-            let block = match (args.colour == Colour::Linear, &white) {
-                (true, None) => in_linear_light(block),
-                (true, Some(found)) => white::in_linear_light(in_linear_light(block), found.gains),
-                (false, None) => block,
-                (false, Some(found)) => white::in_srgb(block, found.gains),
-            };
-            let block = match rotation {
-                Some(rotation) => axes::turned(block, rotation),
-                None => block,
-            };
-            writer.write(&block)?;
+    let converted = |block: Gaussians| {
+        let block = match (args.colour == Colour::Linear, &white) {
+            (true, None) => in_linear_light(block),
+            (true, Some(found)) => white::in_linear_light(in_linear_light(block), found.gains),
+            (false, None) => block,
+            (false, Some(found)) => white::in_srgb(block, found.gains),
+        };
+        match rotation {
+            Some(rotation) => axes::turned(block, rotation),
+            None => block,
         }
-        writer.finish().map(|_| ())
-    })?;
-    output::line(format!("model: {} ({count} Gaussians)", args.output.display()));
+    };
+    if format_of(args, to) == Format::CompressedPly {
+        let mut whole = Gaussians::empty(layout.sh_degree());
+        while let Some(block) = reader.next_block(BLOCK)? {
+            let block = converted(block);
+            (0..block.len()).for_each(|index| whole.push_from(&block, index));
+        }
+        write_compressed(to, &whole, &comments)?;
+    } else {
+        write_whole(to, |file| {
+            let name = to.to_string_lossy();
+            let mut writer = SplatWriter::new(file, &name, count, layout.sh_degree(), &comments)?;
+            while let Some(block) = reader.next_block(BLOCK)? {
+                writer.write(&converted(block))?;
+            }
+            writer.finish().map(|_| ())
+        })?;
+        output::line(format!("model: {} ({count} Gaussians)", to.display()));
+    }
     white.iter().for_each(|found| output::line(white_point::summary(found)));
+    Ok(())
+}
+
+/// The form to write: the requested one, or that of the name.
+fn format_of(args: &ExportArgs, to: &Path) -> Format {
+    let is_compressed = to.to_string_lossy().to_lowercase().ends_with(".compressed.ply");
+    args.format.unwrap_or(if is_compressed { Format::CompressedPly } else { Format::Ply })
+}
+
+fn write_compressed(to: &Path, model: &Gaussians, comments: &[String]) -> Result<()> {
+    let copy = ply::compressed(model, comments)?;
+    write_whole(to, |file| file.write_all(&copy.bytes).map_err(CoreError::io("write", to)))?;
+    let bytes = output::bytes(copy.bytes.len() as u64);
+    output::line(format!("model: {} ({} Gaussians, {bytes})", to.display(), copy.gaussians));
+    handover::remark_on(&copy);
     Ok(())
 }
 
@@ -185,7 +239,7 @@ fn white_point_comment(found: Option<&WhitePoint>, comments: &mut Vec<String>) -
 }
 
 /// Writes the model with colours that make viewers show its J.
-fn for_viewers(args: &ExportArgs, path: &Path, white: Option<&WhitePoint>) -> Result<()> {
+fn for_viewers(args: &ExportArgs, to: &Path, path: &Path, white: Option<&WhitePoint>) -> Result<()> {
     let record = ply::water_record(path)?
         .filter(|record| record.composition.blends_in_linear_light())
         .ok_or_else(|| {
@@ -230,8 +284,12 @@ fn for_viewers(args: &ExportArgs, path: &Path, white: Option<&WhitePoint>) -> Re
             axes::turned(model, rotation)
         }
     };
-    ply::write_model(&args.output, &model, &comments)?;
-    output::line(format!("model: {} ({} Gaussians)", args.output.display(), model.len()));
+    if format_of(args, to) == Format::CompressedPly {
+        write_compressed(to, &model, &comments)?;
+    } else {
+        ply::write_model(to, &model, &comments)?;
+        output::line(format!("model: {} ({} Gaussians)", to.display(), model.len()));
+    }
     white.iter().for_each(|found| output::line(white_point::summary(found)));
     Ok(())
 }

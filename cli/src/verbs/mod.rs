@@ -98,7 +98,7 @@ pub enum Verb {
     Render(render::RenderArgs),
     /// Show a model in the browser, with the water that was trained
     View(view::ViewArgs),
-    /// Write a model for other programs, its colours in sRGB or in linear light
+    /// Write a model for other programs, or one page that shows it in a browser
     Export(export::ExportArgs),
     /// Make a synthetic scene with exact ground truth
     Synth(synth::SynthArgs),

@@ -212,6 +212,7 @@ fn of_store(record: &access::TokenRecord) -> Token {
         create_time: Some(time(record.created_ms)),
         expire_time: record.expires_ms.map(time),
         revoke_time: record.revoked_ms.map(time),
+        job_id: record.job.as_ref().map(ToString::to_string).unwrap_or_default(),
     }
 }
 
@@ -249,6 +250,7 @@ fn token_json(token: &Token) -> Value {
         "name": token.name,
         "role": role_word(token),
         "tenant": (!token.tenant.is_empty()).then_some(&token.tenant),
+        "job": (!token.job_id.is_empty()).then_some(&token.job_id),
         "created_unix_seconds": json::unix_seconds(&token.create_time),
         "expires_unix_seconds": json::unix_seconds(&token.expire_time),
         "revoked_unix_seconds": json::unix_seconds(&token.revoke_time),

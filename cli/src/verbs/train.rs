@@ -4,6 +4,7 @@
 //! all state needed to resume it.
 
 use std::collections::BTreeSet;
+use std::io::IsTerminal as _;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
@@ -42,6 +43,10 @@ pub struct TrainArgs {
     workers: u32,
     #[command(flatten)]
     gpu: GpuArgs,
+    /// Show the run on a page in the browser while it lasts, and print its link; the link is for you alone
+    /// [default: true in a terminal]
+    #[arg(long, num_args = 0..=1, default_missing_value = "true", require_equals = true, value_name = "BOOL")]
+    web: Option<bool>,
     /// Resume the interrupted run in OUT
     #[arg(long)]
     resume: bool,
@@ -75,7 +80,11 @@ pub async fn run(args: TrainArgs) -> Result<()> {
         .zip(adapters)
         .map(|(index, adapter)| worker_arguments(index, adapter, &args.gpu, &run))
         .collect();
-    let mut children = Children::start(&run.store(), &run.logs(), &worker_arguments).await?;
+    let with_page = args.web.unwrap_or_else(|| std::io::stderr().is_terminal());
+    let mut children = Children::start(&run.store(), &run.logs(), &worker_arguments, with_page).await?;
+    if let Some(page) = &children.page {
+        output::remark(format!("see the run at {page}"));
+    }
     let job = Submission { data: &data, prepared: &prepared, config: &config, begin };
     let url = children.url.clone();
     let outcome = tokio::select! {

@@ -15,19 +15,15 @@ use axum::http::{HeaderValue, Method, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use clap::Args;
 use fathom_web::Refused;
-use serde_json::{Value, json};
 use tokio::io::AsyncReadExt as _;
 
 use crate::children;
 use crate::error::{CliError, Result};
 use crate::output;
+use crate::viewed::Viewed;
 
 /// Bytes of a file that are read at a time.
 const PIECE_BYTES: usize = 256 << 10;
-/// What the viewer reads.
-const MODELS: [&str; 2] = ["ply", "sog"];
-/// Endings of photographs that browsers show.
-const PHOTOGRAPHS: [&str; 4] = ["png", "jpg", "jpeg", "webp"];
 
 /// Arguments of `fathom view`.
 #[derive(Args, Debug)]
@@ -58,82 +54,11 @@ struct Scene {
 
 impl Scene {
     fn read(args: &ViewArgs) -> Result<Self> {
-        let wrong = |message: String| CliError::Message(message);
-        let is_result = args.model.is_dir();
-        let model = if is_result { args.model.join("model.ply") } else { args.model.clone() };
-        if !model.is_file() {
-            let advice = "name a result folder of `fathom train`, or a model (.ply, .compressed.ply, .sog)";
-            return Err(wrong(format!("{} is no file; {advice}", model.display())));
-        }
-        let ending = model.extension().unwrap_or_default().to_string_lossy().to_lowercase();
-        if !MODELS.contains(&ending.as_str()) {
-            let path = model.display();
-            return Err(wrong(format!(
-                "{path} is no model that the viewer reads: .ply, .compressed.ply or .sog"
-            )));
-        }
-        // Beside other models there may be files of something else.
-        let folder = model.parent().filter(|_| is_result || model.ends_with("model.ply"));
-        let beside = |name: &str| {
-            let path = folder.map(|folder| folder.join(name)).filter(|path| path.is_file());
-            path.map_or(Ok(Value::Null), |path| output::read_json(&path))
-        };
-        let cameras = beside("cameras.json")?;
-        let file_name = model.file_name().unwrap_or_default().to_string_lossy();
-        // The engine knows a model by its ending, and spaces would have to be escaped.
-        let served = if file_name.to_lowercase().ends_with(".compressed.ply") {
-            "model.compressed.ply".to_owned()
-        } else {
-            format!("model.{ending}")
-        };
-        let mut files = BTreeMap::from([(served.clone(), model.clone())]);
-        let mut photographs = serde_json::Map::new();
-        if let Some(folder) = &args.photographs {
-            for (index, name) in names(&cameras).enumerate() {
-                let Some(path) = photograph(folder, name) else { continue };
-                let ending = path.extension().unwrap_or_default().to_string_lossy().into_owned();
-                let served = format!("photographs/{index}.{ending}");
-                photographs.insert(name.to_owned(), served.clone().into());
-                files.insert(served, path);
-            }
-            if photographs.is_empty() {
-                let folder = folder.display();
-                return Err(wrong(format!(
-                    "{folder} has no photograph that {} names",
-                    model.with_file_name("cameras.json").display()
-                )));
-            }
-        }
-        let title = if is_result { &args.model } else { &model };
-        let title = title.canonicalize().unwrap_or_else(|_| title.clone());
-        let json = json!({
-            "name": title.file_name().unwrap_or_default().to_string_lossy(),
-            "model": served,
-            "water": beside("water.json")?,
-            "cameras": cameras,
-            "plan": beside("plan.json")?,
-            "photographs": photographs,
-            "credits": args.credits,
-        });
-        Ok(Self { json: json.to_string(), files })
+        let viewed = Viewed::read(&args.model, args.photographs.as_deref(), &args.credits)?;
+        let mut files = viewed.photographs;
+        files.insert(viewed.model_name, viewed.model);
+        Ok(Self { json: viewed.json.to_string(), files })
     }
-}
-
-/// The photographs that cameras.json names.
-fn names(cameras: &Value) -> impl Iterator<Item = &str> {
-    cameras.as_array().into_iter().flatten().filter_map(|camera| camera["img_name"].as_str())
-}
-
-/// The file of a photograph, in the folder of the photographs or of the scene. Names come from a file that
-/// may be somebody else's, so one that leaves the folder or is no picture is no photograph.
-fn photograph(folder: &Path, name: &str) -> Option<PathBuf> {
-    let whole = folder.canonicalize().ok()?;
-    let found = [folder.join(name), folder.join("images").join(name)];
-    let mut found = found.into_iter().filter_map(|path| path.canonicalize().ok());
-    found.find(|path| {
-        let ending = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
-        path.starts_with(&whole) && path.is_file() && PHOTOGRAPHS.contains(&ending.as_str())
-    })
 }
 
 struct Served {
@@ -226,6 +151,8 @@ async fn contents(path: &Path) -> std::io::Result<(u64, Body)> {
 
 #[cfg(test)]
 mod tests {
+    use serde_json::{Value, json};
+
     use super::*;
 
     fn read(words: &[&str]) -> Result<Scene> {

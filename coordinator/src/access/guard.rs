@@ -52,7 +52,7 @@ static METHODS: LazyLock<HashSet<String>> = LazyLock::new(|| {
 });
 
 /// Methods of JobService that change nothing.
-const LOOKS: [&str; 5] = ["GetJob", "ListJobs", "WatchJob", "StreamLogs", "ListArtifacts"];
+const LOOKS: [&str; 6] = ["GetJob", "ListJobs", "WatchJob", "StreamLogs", "GetHistory", "ListArtifacts"];
 
 /// Methods of UploadService that change nothing and that users call.
 const LOOKS_AT_UPLOADS: [&str; 3] = ["ReadBlob", "GetDataset", "ListDatasets"];
@@ -64,6 +64,9 @@ const OF_BLOBS: [&str; 7] =
 fn may(caller: &Principal, service: &str, method: &str) -> bool {
     use Role::{Operator, Submitter, Viewer, Worker};
     match (service, caller.role) {
+        (ADMIN, _) if method == "GetCaller" => true,
+        // Datasets are not those of the job alone.
+        (UPLOADS, Viewer) if caller.job.is_some() => method == "ReadBlob",
         (JOBS, Viewer) => LOOKS.contains(&method),
         (JOBS, Submitter | Operator) => true,
         (UPLOADS, Viewer) => LOOKS_AT_UPLOADS.contains(&method),
@@ -131,6 +134,9 @@ impl Guard {
             return Ok(Some(caller));
         }
         if !may(&caller, service, method) {
+            if caller.job.is_some() {
+                return Err(ServiceError::OfLink);
+            }
             let (role, of_tenant) = (caller.role, caller.tenant.is_some());
             return Err(ServiceError::RoleRefused { role, need: need_of(service, method), of_tenant });
         }
@@ -264,7 +270,7 @@ mod tests {
 
     fn caller(role: Role, tenant: Option<&str>) -> Principal {
         let tenant = tenant.map(|tenant| tenant.parse().unwrap());
-        Principal { name: String::new(), role, tenant, token_id: Some(String::new()) }
+        Principal { role, tenant, token_id: Some(String::new()), ..Principal::anonymous() }
     }
 
     fn allowed(caller: &Principal) -> Vec<String> {
@@ -295,21 +301,28 @@ mod tests {
     #[test]
     fn each_role_permits_exactly_its_own_methods() {
         let viewer = allowed(&caller(Role::Viewer, Some("reef")));
-        let looks = ["GetJob", "ListJobs", "WatchJob", "StreamLogs", "ListArtifacts"];
+        let looks = ["GetJob", "ListJobs", "WatchJob", "StreamLogs", "GetHistory", "ListArtifacts"];
         let mut wanted: Vec<String> = looks.iter().map(|method| format!("{JOBS}/{method}")).collect();
         let of_uploads = ["ReadBlob", "GetDataset", "ListDatasets"];
         wanted.extend(of_uploads.map(|method| format!("{UPLOADS}/{method}")));
+        wanted.push(format!("{ADMIN}/GetCaller"));
         let (mut found, mut expected) = (viewer.clone(), wanted);
         found.sort();
         expected.sort();
         assert_eq!(found, expected);
 
+        let job = "01a21ea5539c6b5f23ab".parse().ok();
+        let link = allowed(&Principal { job, ..caller(Role::Viewer, Some("reef")) });
+        let of_link = viewer.iter().filter(|path| !path.ends_with("Dataset") && !path.ends_with("Datasets"));
+        assert!(link.iter().eq(of_link), "{link:?}");
+
         let submitter = allowed(&caller(Role::Submitter, Some("reef")));
-        assert!(submitter.iter().all(|path| path.starts_with("fathom.v1.")), "{submitter:?}");
+        let who = format!("{ADMIN}/GetCaller");
+        assert!(submitter.iter().all(|path| path.starts_with("fathom.v1.") || *path == who), "{submitter:?}");
         assert_eq!(submitter, allowed(&caller(Role::Operator, Some("reef"))));
         let worker = allowed(&caller(Role::Worker, None));
         assert!(
-            worker.iter().all(|path| path.starts_with(WORKERS) || path.starts_with(UPLOADS)),
+            worker.iter().all(|path| path.starts_with(WORKERS) || path.starts_with(UPLOADS) || *path == who),
             "{worker:?}"
         );
         let of_uploads: Vec<_> = worker.iter().filter_map(|path| path.strip_prefix(UPLOADS)).collect();

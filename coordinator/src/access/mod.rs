@@ -18,7 +18,7 @@ pub use rate::RateLimit;
 pub use table::{Access, Refused};
 pub use token::{IssueError, Token, TokenRecord};
 
-use crate::schedule::{ParseIdError, Tenant};
+use crate::schedule::{JobId, ParseIdError, Tenant};
 
 /// The role of a caller.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -70,12 +70,19 @@ pub struct Principal {
     pub tenant: Option<Tenant>,
     /// The id of its token; `None` where none is required.
     pub token_id: Option<String>,
+    /// The only job that it sees; `None`: all of its tenant.
+    pub job: Option<JobId>,
 }
 
 impl Principal {
     /// The caller where no tokens are required.
     pub fn anonymous() -> Self {
-        Self { name: "anybody".to_owned(), role: Role::Operator, tenant: None, token_id: None }
+        Self { name: "anybody".to_owned(), role: Role::Operator, tenant: None, token_id: None, job: None }
+    }
+
+    /// Whether it may see a job, if the job is one of a tenant that it sees.
+    pub fn sees_job(&self, job: &JobId) -> bool {
+        self.job.as_ref().is_none_or(|own| own == job)
     }
 
     /// Whether it may see objects of a tenant.

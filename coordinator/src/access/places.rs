@@ -131,7 +131,7 @@ mod tests {
 
     fn caller(role: Role, tenant: &str) -> Principal {
         let tenant = Some(tenant.parse().unwrap_or_default());
-        Principal { name: String::new(), role, tenant, token_id: Some(String::new()) }
+        Principal { role, tenant, token_id: Some(String::new()), ..Principal::anonymous() }
     }
 
     #[test]

@@ -9,6 +9,7 @@ use tokio::sync::watch;
 
 use super::{Principal, Token, TokenRecord};
 use crate::clock::Clock;
+use crate::schedule::Tenant;
 use crate::store::{AccessStore, StoreError};
 
 /// The tokens. They are also stored; the store is written first.
@@ -67,13 +68,15 @@ impl Access {
         let token = shown.split_once(' ').filter(|(scheme, _)| is_bearer(scheme));
         let token = token.and_then(|(_, token)| Token::parse(token.trim())).ok_or(Refused::NotValid)?;
         let tokens = tokens.read().unwrap_or_else(PoisonError::into_inner);
-        let record = tokens.get(token.id()).filter(|record| record.is_of(&token) && record.holds_at(now_ms));
+        let record = tokens.get(token.id()).filter(|record| record.is_of(&token));
+        let record = record.filter(|record| holds(&tokens, record, now_ms));
         let record = record.ok_or(Refused::NotValid)?;
         Ok(Principal {
             name: record.name.clone(),
             role: record.role,
             tenant: record.tenant.clone(),
             token_id: Some(record.id.clone()),
+            job: record.job.clone(),
         })
     }
 
@@ -81,7 +84,26 @@ impl Access {
     pub fn still_holds(&self, caller: &Principal, now_ms: u64) -> bool {
         let (Some(tokens), Some(id)) = (&self.tokens, &caller.token_id) else { return true };
         let tokens = tokens.read().unwrap_or_else(PoisonError::into_inner);
-        tokens.get(id).is_some_and(|record| record.holds_at(now_ms))
+        tokens.get(id).is_some_and(|record| holds(&tokens, record, now_ms))
+    }
+
+    /// Links of a tenant that were issued since a time, valid or not.
+    pub fn links_since(&self, tenant: &Tenant, since_ms: u64) -> usize {
+        let Some(tokens) = &self.tokens else { return 0 };
+        let tokens = tokens.read().unwrap_or_else(PoisonError::into_inner);
+        let is_new = |token: &&TokenRecord| {
+            token.job.is_some() && token.tenant.as_ref() == Some(tenant) && token.created_ms > since_ms
+        };
+        tokens.values().filter(is_new).count()
+    }
+
+    /// Forgets a token that is no longer stored.
+    pub fn forget(&self, id: &str) {
+        if let Some(tokens) = &self.tokens {
+            let mut tokens = tokens.write().unwrap_or_else(PoisonError::into_inner);
+            self.noted.fetch_add(1, Ordering::Relaxed);
+            tokens.remove(id);
+        }
     }
 
     /// Waits until the token of an accepted caller becomes invalid.
@@ -105,7 +127,8 @@ impl Access {
         }
     }
 
-    fn expires_ms(&self, caller: &Principal) -> Option<u64> {
+    /// When the token of an accepted caller expires, Unix milliseconds; `None`: never.
+    pub fn expires_ms(&self, caller: &Principal) -> Option<u64> {
         let tokens = self.tokens.as_ref()?.read().unwrap_or_else(PoisonError::into_inner);
         tokens.get(caller.token_id.as_ref()?)?.expires_ms
     }
@@ -139,13 +162,20 @@ impl Access {
     }
 }
 
+/// Whether a token is valid now, and so is the one with which it was made.
+fn holds(tokens: &HashMap<String, TokenRecord>, record: &TokenRecord, now_ms: u64) -> bool {
+    let issuer = record.issued_by.as_ref();
+    let issuer_holds = |id: &String| tokens.get(id).is_some_and(|issuer| issuer.holds_at(now_ms));
+    record.holds_at(now_ms) && issuer.is_none_or(issuer_holds)
+}
+
 #[cfg(test)]
 mod tests {
     use tonic::async_trait;
 
     use super::*;
     use crate::access::Role;
-    use crate::schedule::{Quota, Rules, Tenant, Usage};
+    use crate::schedule::{Quota, Rules, Usage};
     use crate::store::MemoryStore;
 
     #[test]
@@ -170,6 +200,26 @@ mod tests {
         access.note(TokenRecord { revoked_ms: Some(60), ..record });
         assert!(!access.still_holds(&caller, 60));
         assert_eq!(with(&shown), Err(Refused::NotValid), "it was revoked");
+    }
+
+    #[test]
+    fn a_link_is_valid_only_with_the_token_that_made_it() {
+        let issuer = Token::random();
+        let by = TokenRecord::new(&issuer, "ana".into(), Role::Submitter, None, 0, None);
+        let access = Access::by_tokens(vec![by.clone()]);
+        let caller = access.principal(Some(&format!("Bearer {}", issuer.reveal())), 1).unwrap();
+        let job = "01a21ea5539c6b5f23ab".parse::<crate::schedule::JobId>().unwrap();
+        let (token, link) = TokenRecord::of_link(job.clone(), Tenant::default(), &caller, 5, 100);
+        assert_eq!(link.issued_by.as_deref(), Some(issuer.id()));
+        access.note(link.clone());
+        let shown = format!("Bearer {}", token.reveal());
+        let guest = access.principal(Some(&shown), 10).unwrap();
+        assert_eq!((guest.job, guest.role), (Some(job), Role::Viewer));
+        assert_eq!(access.links_since(&Tenant::default(), 4), 1);
+        assert_eq!(access.links_since(&Tenant::default(), 5), 0);
+        access.note(TokenRecord { revoked_ms: Some(20), ..by });
+        assert_eq!(access.principal(Some(&shown), 30), Err(Refused::NotValid));
+        assert!(link.is_link_ended_before(101) && !link.is_link_ended_before(100));
     }
 
     #[tokio::test(start_paused = true)]
@@ -255,6 +305,10 @@ mod tests {
 
         async fn put_token(&self, token: &TokenRecord) -> Result<(), StoreError> {
             self.store.put_token(token).await
+        }
+
+        async fn forget_token(&self, id: &str) -> Result<(), StoreError> {
+            self.store.forget_token(id).await
         }
     }
 

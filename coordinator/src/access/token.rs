@@ -5,8 +5,8 @@ use std::fmt;
 use serde::{Deserialize, Serialize};
 use uuid::Uuid;
 
-use super::Role;
-use crate::schedule::Tenant;
+use super::{Principal, Role};
+use crate::schedule::{JobId, Tenant};
 
 /// Prefix of every token, so that secret scanners find committed ones.
 const PREFIX: &str = "fathom";
@@ -96,6 +96,12 @@ pub struct TokenRecord {
     pub expires_ms: Option<u64>,
     /// When it was revoked, Unix milliseconds.
     pub revoked_ms: Option<u64>,
+    /// The only job that it reads: the token of a link. `None`: all of its tenant.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub job: Option<JobId>,
+    /// Of a link: the token with which it was made, without which it is not valid.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub issued_by: Option<String>,
 }
 
 impl TokenRecord {
@@ -109,7 +115,39 @@ impl TokenRecord {
         expires_ms: Option<u64>,
     ) -> Self {
         let digest = token.digest().to_hex().to_string();
-        Self { id: token.id.clone(), name, role, tenant, digest, created_ms, expires_ms, revoked_ms: None }
+        Self {
+            id: token.id.clone(),
+            name,
+            role,
+            tenant,
+            digest,
+            created_ms,
+            expires_ms,
+            revoked_ms: None,
+            job: None,
+            issued_by: None,
+        }
+    }
+
+    /// Makes the token of a link to one job, which reads this job until it expires.
+    pub fn of_link(
+        job: JobId,
+        tenant: Tenant,
+        by: &Principal,
+        created_ms: u64,
+        expires_ms: u64,
+    ) -> (Token, Self) {
+        let token = Token::random();
+        let mut name = format!("link to {job} by {}", by.name);
+        name.truncate(name.floor_char_boundary(MAX_NAME_BYTES));
+        let record = Self::new(&token, name, Role::Viewer, Some(tenant), created_ms, Some(expires_ms));
+        (token, Self { job: Some(job), issued_by: by.token_id.clone(), ..record })
+    }
+
+    /// Whether it is the token of a link that has ended before a time.
+    pub fn is_link_ended_before(&self, before_ms: u64) -> bool {
+        let ended_ms = self.revoked_ms.into_iter().chain(self.expires_ms).min();
+        self.job.is_some() && ended_ms.is_some_and(|ended_ms| ended_ms < before_ms)
     }
 
     /// Makes a token that lasts `expires_in_seconds` (0: forever), for a tenant, or for all if `tenant` is

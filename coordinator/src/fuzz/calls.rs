@@ -77,7 +77,15 @@ pub fn task_stats() -> worker::TaskStats {
         adapter: "GPU".into(),
         resumed_from_iteration: 3,
         held_out: vec![metrics; 2],
+        measured: vec![measured()],
     }
+}
+
+/// A point of a curve with a preview.
+pub fn measured() -> worker::Measured {
+    let progress = v1::Progress { iteration: 7, loss: 0.1, ..Default::default() };
+    let preview = v1::Preview { view: "one.jpg".into(), iteration: 7, render: blob(), clear: blob() };
+    worker::Measured { progress: Some(progress), age_ms: 500, previews: vec![preview] }
 }
 
 /// A coordinator with one job.
@@ -126,6 +134,8 @@ impl Coordinator {
             access: Arc::new(Access::open()),
             logs: Arc::new(JobLogs::new(&folder.path().join("logs"), 1 << 16)),
             own_lines: Arc::default(),
+            history: Default::default(),
+            links: Default::default(),
             metrics: Arc::default(),
             clock,
             lease_ms: 30_000,
@@ -213,6 +223,8 @@ fn fuzzed_calls_of_users_are_answered_or_refused() {
         (4, v1::ResumeJobRequest { job_id: job_id.clone() }.encode_to_vec()),
         (5, update.encode_to_vec()),
         (6, artifacts.encode_to_vec()),
+        (10, v1::GetHistoryRequest { job_id: job_id.clone(), ..Default::default() }.encode_to_vec()),
+        (11, v1::ShareJobRequest { job_id: job_id.clone(), expires_in_seconds: 60 }.encode_to_vec()),
     ];
     fuzz("calls of JobService", &corpus, async |shared, which, bytes| {
         let jobs = Jobs(Arc::clone(shared));
@@ -227,6 +239,9 @@ fn fuzzed_calls_of_users_are_answered_or_refused() {
             7 => jobs.cancel_job(message(bytes)?).await.ok().map(drop),
             8 => jobs.retry_job(message(bytes)?).await.ok().map(drop),
             9 => jobs.delete_job(message(bytes)?).await.ok().map(drop),
+            10 => jobs.get_history(message(bytes)?).await.ok().map(drop),
+            // No token is required here, so there is no link.
+            11 => jobs.share_job(message(bytes)?).await.map_or_else(|_| Some(()), |_| None),
             _ => None,
         }
     });
@@ -322,7 +337,7 @@ fn fuzzed_calls_of_workers_are_answered_or_refused() {
         held: vec![lease().unwrap()],
     };
     let progress = Some(v1::Progress { iteration: 7, loss: 0.1, ..Default::default() });
-    let renewals = vec![worker::Renewal { lease: lease(), progress }];
+    let renewals = vec![worker::Renewal { lease: lease(), progress, measured: vec![measured()] }];
     let corpus = [
         (0, register.encode_to_vec()),
         (

@@ -4,7 +4,7 @@ use fathom_fuzz::{Target, run};
 use fathom_proto::{admin::v1 as admin, v1, worker::v1 as worker};
 use prost::Message;
 
-use super::calls::{blob, lease, task_stats};
+use super::calls::{blob, lease, measured, task_stats};
 
 /// A target for one kind of message.
 fn fuzz<M: Message + Default>(sound: M) {
@@ -44,6 +44,8 @@ fn fuzzed_messages_of_users_are_decoded_or_refused() {
     });
     fuzz(v1::StreamLogsRequest { job_id: job_id(), task_id: "merge".into(), ..Default::default() });
     fuzz(v1::GetJobRequest { job_id: job_id() });
+    fuzz(v1::GetHistoryRequest { job_id: job_id(), ..Default::default() });
+    fuzz(v1::ShareJobRequest { job_id: job_id(), expires_in_seconds: 60 });
     fuzz(v1::WatchJobRequest { job_id: job_id(), after_seq: 7 });
     fuzz(v1::CancelJobRequest { job_id: job_id(), reason: "why".into() });
     fuzz(v1::PauseJobRequest { job_id: job_id(), reason: "why".into() });
@@ -106,7 +108,11 @@ fn fuzzed_messages_of_workers_are_decoded_or_refused() {
     });
     let renewal = worker::RenewRequest {
         incarnation: "6f9619ff-8b86-4d01-b42d-00cf4fc964ff".into(),
-        renewals: vec![worker::Renewal { lease: lease(), progress: Some(progress) }],
+        renewals: vec![worker::Renewal {
+            lease: lease(),
+            progress: Some(progress),
+            measured: vec![measured()],
+        }],
     };
     fuzz(worker::SessionRequest { renewal: Some(renewal.clone()) });
     fuzz(renewal);

@@ -3,8 +3,11 @@
 //! The lines of an attempt lie in append-only segments, `TASK.ATTEMPT.SEGMENT`, one JSON object a line. When
 //! an attempt exceeds its limit, its second segment is removed, later the next ones, so that its beginning
 //! and end are kept. A line that a crash truncated is skipped.
+//!
+//! The history of a task is the file `TASK.history`, which is replaced as a whole.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::ffi::OsStr;
 use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -20,10 +23,12 @@ use super::{
     Wanted,
 };
 use crate::objects::ObjectError;
-use crate::schedule::JobId;
+use crate::schedule::{JobId, TaskId};
 
 /// Maximum jobs with cached file data; the least recently used ones are reread.
 const OPEN_JOBS: usize = 256;
+/// Ending of the file of a history, behind the task.
+const HISTORY: &str = ".history";
 
 /// The logs of all jobs, in files.
 pub struct JobLogs(Arc<Folders>);
@@ -95,6 +100,15 @@ impl Logs for JobLogs {
             Ok(Page { lines, position, more })
         })
         .await
+    }
+
+    async fn put_history(&self, job: &JobId, task: TaskId, history: Vec<u8>) -> Result<(), LogError> {
+        self.blocking("write a history", job, move |folders, job| folders.put_history(job, task, &history))
+            .await
+    }
+
+    async fn histories(&self, job: &JobId, task: Option<TaskId>) -> Result<Vec<(TaskId, Vec<u8>)>, LogError> {
+        self.blocking("read the histories", job, move |folders, job| folders.histories(job, task)).await
     }
 
     async fn remove(&self, job: &JobId) -> Result<(), LogError> {
@@ -266,7 +280,45 @@ impl Folders {
         Ok(())
     }
 
-    /// Removes the lines of a job.
+    /// Replaces the history of a task.
+    ///
+    /// # Errors
+    /// When the disk fails; the old history stays.
+    fn put_history(&self, job: &JobId, task: TaskId, history: &[u8]) -> io::Result<()> {
+        let log = self.open(job)?;
+        // One at a time, and none while the job is removed.
+        let _log = lock(&log);
+        let folder = self.folder(job);
+        std::fs::create_dir_all(&folder)?;
+        let half_written = folder.join(format!("{task}.history.new"));
+        std::fs::write(&half_written, history)?;
+        std::fs::rename(half_written, folder.join(format!("{task}{HISTORY}")))
+    }
+
+    /// The history of one task, or of all.
+    ///
+    /// # Errors
+    /// When a file cannot be read.
+    fn histories(&self, job: &JobId, task: Option<TaskId>) -> io::Result<Vec<(TaskId, Vec<u8>)>> {
+        let folder = self.folder(job);
+        let tasks: BTreeSet<TaskId> = match task {
+            Some(task) => BTreeSet::from([task]),
+            None => {
+                let entries = absent_is(std::fs::read_dir(&folder).map(Some), None)?;
+                let names = entries.into_iter().flatten().collect::<io::Result<Vec<_>>>()?;
+                let task = |name: &OsStr| name.to_str()?.strip_suffix(HISTORY)?.parse().ok();
+                names.iter().filter_map(|entry| task(&entry.file_name())).collect()
+            }
+        };
+        let mut histories = Vec::new();
+        for task in tasks {
+            let read = std::fs::read(folder.join(format!("{task}{HISTORY}"))).map(Some);
+            histories.extend(absent_is(read, None)?.map(|history| (task, history)));
+        }
+        Ok(histories)
+    }
+
+    /// Removes the lines and histories of a job.
     ///
     /// # Errors
     /// When its files cannot be removed.
@@ -285,13 +337,8 @@ impl Folders {
     /// # Errors
     /// When the folder cannot be read.
     fn jobs(&self) -> io::Result<Vec<JobId>> {
-        let entries = match std::fs::read_dir(&self.root) {
-            Ok(entries) => entries,
-            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
-            Err(error) => return Err(error),
-        };
         let mut jobs = Vec::new();
-        for entry in entries {
+        for entry in absent_is(std::fs::read_dir(&self.root).map(Some), None)?.into_iter().flatten() {
             jobs.extend(entry?.file_name().to_str().and_then(|name| name.parse::<JobId>().ok()));
         }
         Ok(jobs)
@@ -312,6 +359,14 @@ fn forget_old_attempts(
         }
     }
     Ok(())
+}
+
+/// What was read, or `otherwise` if there is nothing at its path.
+fn absent_is<T>(read: io::Result<T>, otherwise: T) -> io::Result<T> {
+    match read {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(otherwise),
+        other => other,
+    }
 }
 
 pub(super) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {

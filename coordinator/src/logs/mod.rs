@@ -1,5 +1,5 @@
-//! Log lines of jobs; they outlive the worker of an attempt. A data directory keeps them in files
-//! ([`JobLogs`]), a database in tables (`store/postgres/logs.rs`), where all its coordinators see them.
+//! Log lines and histories of jobs; they outlive the worker of an attempt. A data directory keeps them in
+//! files ([`JobLogs`]), a database in tables (`store/postgres/logs.rs`), where all its coordinators see them.
 //!
 //! Each line has a number that ascends in its job in the order of arrival (microseconds of the clock, so that
 //! it ascends over restarts as well). Numbers of lines are even; odd ones are for notices to readers.
@@ -7,7 +7,7 @@
 //!
 //! Of a long attempt only the first and the latest lines are kept, by segments: when there is one too many,
 //! the second is removed. Nothing is synced: a power cut may lose the latest lines, but never affects an
-//! answer of the service.
+//! answer of the service. The history of a task is one small value that is replaced (`crate::history`).
 
 mod files;
 mod read;
@@ -192,10 +192,16 @@ pub trait Logs: Send + Sync {
         limit: usize,
     ) -> Result<Page, LogError>;
 
-    /// Removes the lines of a job.
+    /// Replaces the history of a task.
+    async fn put_history(&self, job: &JobId, task: TaskId, history: Vec<u8>) -> Result<(), LogError>;
+
+    /// The history of one task, or of all of a job, by task.
+    async fn histories(&self, job: &JobId, task: Option<TaskId>) -> Result<Vec<(TaskId, Vec<u8>)>, LogError>;
+
+    /// Removes the lines and the histories of a job.
     async fn remove(&self, job: &JobId) -> Result<(), LogError>;
 
-    /// Jobs with lines, whether or not the jobs exist.
+    /// Jobs with lines or histories, whether or not the jobs exist.
     async fn jobs(&self) -> Result<Vec<JobId>, LogError>;
 
     /// The highest number in a job; 0 when it has no lines.
@@ -215,7 +221,7 @@ pub fn of(store: &dyn Store, data_dir: &Path, attempt_bytes: u64) -> Arc<dyn Log
 /// Lines per step of a copy.
 const COPIED_AT_ONCE: usize = 1024;
 
-/// Copies the lines that `to` does not have yet; returns their number.
+/// Copies the histories, and the lines that `to` does not have yet; returns the number of lines.
 ///
 /// # Errors
 /// When either side fails. What was copied stays.
@@ -228,6 +234,9 @@ pub async fn copy(from: &dyn Logs, to: &dyn Logs) -> Result<u64, LogError> {
             Page { lines, position, more } = from.read(&job, &Wanted::ALL, position, COPIED_AT_ONCE).await?;
             copied += lines.iter().filter(|line| !line.row.is_notice()).count() as u64;
             to.import(&job, lines).await?;
+        }
+        for (task, history) in from.histories(&job, None).await? {
+            to.put_history(&job, task, history).await?;
         }
     }
     Ok(copied)

@@ -194,6 +194,35 @@ async fn old_attempts_of_a_task_and_deleted_jobs_leave_nothing(kept: Kept) {
     logs.remove(&job()).await.unwrap();
 }
 
+async fn a_history_is_replaced_and_removed_with_its_job(kept: Kept) {
+    let logs = kept.open(4 << 20).await;
+    let tasks = [Stage::Global.task(), Stage::Partition.task_of(3), Stage::Partition.task_of(12)];
+    assert_eq!(logs.histories(&job(), None).await.unwrap(), []);
+    for round in 0..3_u8 {
+        for (index, task) in tasks.iter().rev().enumerate() {
+            logs.put_history(&job(), *task, vec![round, index as u8]).await.unwrap();
+        }
+    }
+    // A line beside them changes nothing, and they are no lines.
+    logs.append(&job(), FIRST, ("w", 1), vec![line(1, "x")], NOW_MS).await.unwrap();
+    let expected: Vec<_> = tasks.iter().zip([2, 1, 0]).map(|(task, index)| (*task, vec![2, index])).collect();
+    let logs = kept.open(4 << 20).await;
+    assert_eq!(logs.histories(&job(), None).await.unwrap(), expected);
+    assert_eq!(logs.histories(&job(), Some(tasks[1])).await.unwrap(), expected[1..2]);
+    assert_eq!(logs.histories(&job(), Some(Stage::Merge.task())).await.unwrap(), []);
+    assert_eq!(messages(&read_after(logs.as_ref(), &ALL, 0, 10).await), ["x"]);
+
+    let folder = tempfile::tempdir().unwrap();
+    let copied = JobLogs::new(folder.path(), 4 << 20);
+    assert_eq!(copy(logs.as_ref(), &copied).await.unwrap(), 1);
+    assert_eq!(copied.histories(&job(), None).await.unwrap(), expected);
+
+    logs.remove(&job()).await.unwrap();
+    assert_eq!(logs.histories(&job(), None).await.unwrap(), []);
+    logs.put_history(&job(), tasks[0], vec![1]).await.unwrap();
+    assert_eq!(logs.jobs().await.unwrap(), [job()], "a late history is found by garbage collection");
+}
+
 async fn a_reader_beside_many_writers_sees_every_line_once_in_order(kept: Kept) {
     // Of a database: two coordinators.
     let logs = match &kept {
@@ -294,6 +323,7 @@ over_both!(
     a_repeated_line_is_stored_once_even_across_a_restart,
     a_long_attempt_keeps_its_first_and_latest_lines,
     old_attempts_of_a_task_and_deleted_jobs_leave_nothing,
+    a_history_is_replaced_and_removed_with_its_job,
     a_reader_beside_many_writers_sees_every_line_once_in_order,
     a_copy_has_the_same_lines_and_numbers_and_goes_on,
 );

@@ -6,11 +6,13 @@ use std::collections::BTreeMap;
 use fathom_core::config::{DEFAULT_MEMORY_GIB, JobConfig, Method, PartitionConfig, WaterPartitions};
 use fathom_core::scene::{Manifest, Points};
 use fathom_core::seams::{self, Axis};
+use fathom_core::views::TrainView;
 use fathom_plan::{Connected, MemoryFrom, Plan, PlanInput, Rect, picture, plan_for};
 use fathom_proto::worker::v1::task_spec::Work;
 use fathom_proto::worker::v1::{
     BordersSpec, CommonSpec, EvaluateSpec, FocusBox, GlobalSpec, PartitionSpec, SeamLine, SeamLines, TaskSpec,
 };
+use glam::{DVec2, DVec3, Vec3Swizzles as _};
 use prost::Message;
 
 use super::OwnTaskError;
@@ -32,7 +34,7 @@ pub async fn plan_job(
     let input = JobInput::read(objects, job).await?;
     require_uploads(objects, &input.manifest).await?;
     let config = input.config.clone();
-    let Drawn { plan, plan_json, plan_png } = draw(objects, job, input, connected).await?;
+    let Drawn { plan, plan_json, plan_png, centres } = draw(objects, job, input, connected).await?;
     tracing::info!(job = %job.job_id, partitions = plan.partitions.len(), reason = plan.cut.reason, "partitioned the scene");
     let mut warnings = plan.warnings(&config.train);
     if config.water.partitions == WaterPartitions::Joint
@@ -47,13 +49,14 @@ pub async fn plan_job(
         warnings.push("borders.enabled has no effect here: it needs more than one partition".into());
     }
     warnings.extend(warning_of_defaults(&plan, connected, &config.partition));
-    let mut tasks = put_partitions(objects, &plan, &config).await?;
+    let mut tasks = put_partitions(objects, &plan, &config, &centres).await?;
     let own = |stage: Stage| (stage.task(), PlannedTask::default());
     if let Some(stage) = &plan.global {
         let common = CommonSpec {
             iterations: stage.iterations,
             max_gaussians: stage.max_gaussians,
             held_out: measured(&plan, &config),
+            previews: previewed(&plan, &config, &centres, &[]),
             ..common_spec(&plan, &plan.training_views(), stage.max_resolution)
         };
         let work = Work::Global(GlobalSpec { view_weights: plan.view_weights() });
@@ -107,6 +110,8 @@ struct Drawn {
     plan: Plan,
     plan_json: Vec<u8>,
     plan_png: Vec<u8>,
+    /// The centre of each view's camera, aligned axes, scene units.
+    centres: Vec<DVec3>,
 }
 
 /// Plans the scene of a job, on a thread for blocking work.
@@ -126,7 +131,9 @@ async fn draw(
         plan.require_points().map_err(|e| OwnTaskError::input(e.to_string()))?;
         let plan_json = serde_json::to_vec_pretty(&plan).map_err(|e| OwnTaskError::failed(e.to_string()))?;
         let plan_png = picture::draw(&plan, &views, &points, &title).map_err(OwnTaskError::failed)?;
-        Ok(Drawn { plan, plan_json, plan_png })
+        let centre = |view: &TrainView| plan.alignment.to_aligned(view.pose.centre().as_vec3().to_array());
+        let centres = views.iter().map(centre).collect();
+        Ok(Drawn { plan, plan_json, plan_png, centres })
     })
     .await
 }
@@ -153,11 +160,30 @@ fn measured(plan: &Plan, config: &JobConfig) -> Vec<u32> {
     if config.train.eval_every > 0 { plan.held_out.clone() } else { Vec::new() }
 }
 
+/// Held-out views for the previews of a run, ascending: those whose cameras are closest to the middle of the
+/// cameras of `near`. If `near` is empty, they are spread over the whole scene.
+fn previewed(plan: &Plan, config: &JobConfig, centres: &[DVec3], near: &[u32]) -> Vec<u32> {
+    let count = if config.train.preview_seconds > 0 { config.train.preview_views as usize } else { 0 };
+    let held_out = &plan.held_out;
+    if near.is_empty() || held_out.len() <= count {
+        let count = count.min(held_out.len());
+        return (0..count).map(|part| held_out[(2 * part + 1) * held_out.len() / (2 * count)]).collect();
+    }
+    let at = |view: u32| centres.get(view as usize).map_or(DVec2::ZERO, |centre| centre.xz());
+    let middle = near.iter().map(|&view| at(view)).sum::<DVec2>() / near.len() as f64;
+    let mut closest = held_out.clone();
+    closest.sort_by(|&a, &b| at(a).distance_squared(middle).total_cmp(&at(b).distance_squared(middle)));
+    closest.truncate(count);
+    closest.sort_unstable();
+    closest
+}
+
 /// The tasks of all partitions: the first part before the exchange, if there is one, and the rest.
 async fn put_partitions(
     objects: &BlobStore,
     plan: &Plan,
     config: &JobConfig,
+    centres: &[DVec3],
 ) -> Result<BTreeMap<TaskId, PlannedTask>, OwnTaskError> {
     let count = plan.partitions.len() as u32;
     let mut tasks = BTreeMap::new();
@@ -168,6 +194,10 @@ async fn put_partitions(
             iterations: partition.iterations,
             max_gaussians: partition.max_gaussians,
             held_out: if plan.global.is_none() { measured(plan, config) } else { Vec::new() },
+            previews: match plan.global {
+                None => previewed(plan, config, centres, &[]),
+                Some(_) => previewed(plan, config, centres, &partition.chosen_views),
+            },
             ..common_spec(plan, &partition.chosen_views, config.data.max_resolution)
         };
         let mut work = PartitionSpec {
@@ -281,9 +311,8 @@ fn seam_lines(lines: &seams::SeamLines) -> SeamLines {
 #[cfg(test)]
 mod tests {
     use fathom_core::scene::{PinholeCamera, Pose};
-    use fathom_core::views::TrainView;
     use fathom_plan::TurnRule;
-    use glam::{DQuat, DVec3};
+    use glam::DQuat;
 
     use super::*;
 
@@ -310,6 +339,29 @@ mod tests {
         assert_eq!(common_spec(&plan, &[3, 11], 0).clear_ranges, [3.0, 11.0]);
         plan.clear_ranges.clear();
         assert!(common_spec(&plan, &[3, 11], 0).clear_ranges.is_empty());
+    }
+
+    #[test]
+    fn previews_show_held_out_views_near_a_partition_or_all_over() {
+        let views = views(64, |i| (DVec3::new(f64::from(i), 0.0, 0.0), DVec3::Z));
+        let mut config = JobConfig::default();
+        let input = PlanInput { views: &views, points: &Points::default(), config: &config };
+        let plan = plan_for(&input, Connected::default()).unwrap();
+        assert_eq!(plan.held_out, [0, 8, 16, 24, 32, 40, 48, 56]);
+        let centres: Vec<DVec3> = views.iter().map(|view| view.pose.centre()).collect();
+        assert_eq!(previewed(&plan, &config, &centres, &[]), [16, 48]);
+        assert_eq!(previewed(&plan, &config, &centres, &[33, 34, 35, 36, 37, 38]), [32, 40]);
+        config.train.preview_views = 8;
+        assert_eq!(previewed(&plan, &config, &centres, &[33]), plan.held_out);
+        for count in 0..=8 {
+            config.train.preview_views = count;
+            let chosen = previewed(&plan, &config, &centres, &[]);
+            assert_eq!(chosen.len(), count as usize);
+            assert!(chosen.is_sorted() && chosen.iter().all(|view| plan.held_out.contains(view)));
+        }
+        config.train.preview_seconds = 0;
+        assert!(previewed(&plan, &config, &centres, &[]).is_empty());
+        assert!(previewed(&plan, &config, &centres, &[33]).is_empty());
     }
 
     #[test]

@@ -9,6 +9,7 @@ use tonic::{Request, Response, Status, async_trait};
 
 use super::backup::BackupStream;
 use super::encode;
+use super::tenants::encode_role;
 use crate::access::guard::caller;
 use crate::schedule::{Attempt, Lease};
 use crate::service_error::{ServiceError, check_line};
@@ -101,6 +102,24 @@ impl Admin {
 
 #[async_trait]
 impl AdminService for Admin {
+    async fn get_caller(
+        &self,
+        request: Request<v1::GetCallerRequest>,
+    ) -> Result<Response<v1::Caller>, Status> {
+        let caller = caller(&request)?;
+        let text = |text: Option<String>| text.unwrap_or_default();
+        Ok(Response::new(v1::Caller {
+            role: encode_role(caller.role).into(),
+            tenant: text(caller.tenant.as_ref().map(ToString::to_string)),
+            job_id: text(caller.job.as_ref().map(ToString::to_string)),
+            expire_time: self.0.access.expires_ms(&caller).map(encode::timestamp),
+            tokens_required: self.0.access.asks_for_tokens(),
+            build_version: env!("CARGO_PKG_VERSION").to_owned(),
+            // The guest of a link need not learn who made it.
+            name: if caller.job.is_some() { "a link".to_owned() } else { caller.name },
+        }))
+    }
+
     async fn list_workers(
         &self,
         _request: Request<v1::ListWorkersRequest>,

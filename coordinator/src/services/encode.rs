@@ -100,6 +100,7 @@ pub fn progress(live: &LiveProgress) -> v1::Progress {
         loss: live.loss,
         iterations_per_second: live.iterations_per_second,
         held_out: live.held_out.as_ref().map(held_out),
+        ..v1::Progress::default()
     }
 }
 

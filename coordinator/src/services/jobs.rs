@@ -10,15 +10,16 @@ use futures::stream::BoxStream;
 use tonic::{Request, Response, Status, async_trait};
 use uuid::Uuid;
 
-use super::{datasets, encode, logs, manifests, watch};
+use super::{datasets, encode, links, logs, manifests, watch};
 use crate::access::Principal;
 use crate::access::guard::caller;
 use crate::capacity::{self, Gap};
+use crate::history;
 use crate::own_tasks::artifacts::ArtifactIndex;
 use crate::schedule::{Artifact, Event, JobId, JobState, TaskRecord, TaskState, Tenant};
 use crate::service_error::{ServiceError, check_line, check_request_id, limit_of};
 use crate::state::State;
-use crate::store::{JobFilter, JobView, NewJob};
+use crate::store::{JobFilter, JobView, NewJob, StoreError};
 
 /// Longest name of a job, bytes.
 const MAX_NAME_BYTES: usize = 200;
@@ -143,7 +144,16 @@ impl Jobs {
         let tenant = asked.or_else(|| caller.tenant.clone());
         let filter = JobFilter { tenant, states, name_contains: request.name_contains };
         let before = page_after(&request.page_token, &filter)?;
-        let jobs = self.0.jobs.list(&filter, before.as_ref(), limit).await?;
+        let jobs = match &caller.job {
+            None => self.0.jobs.list(&filter, before.as_ref(), limit).await?,
+            Some(_) if before.is_some() => Vec::new(),
+            Some(job) => match self.0.jobs.job_row(job).await {
+                Ok(row) => vec![row],
+                Err(StoreError::JobNotFound(_)) => Vec::new(),
+                Err(error) => return Err(error.into()),
+            },
+        };
+        let jobs: Vec<_> = jobs.into_iter().filter(|job| filter.admits(job)).collect();
         let next_page_token = match jobs.last() {
             Some(last) if jobs.len() == limit => page_token(&last.job_id, &filter),
             _ => String::new(),
@@ -288,6 +298,28 @@ impl JobService for Jobs {
     ) -> Result<Response<Self::StreamLogsStream>, Status> {
         let caller = caller(&request)?;
         Ok(Response::new(logs::stream(Arc::clone(&self.0), caller, request.into_inner()).await?))
+    }
+
+    async fn get_history(
+        &self,
+        request: Request<v1::GetHistoryRequest>,
+    ) -> Result<Response<v1::History>, Status> {
+        let caller = caller(&request)?;
+        let v1::GetHistoryRequest { job_id, task_id } = request.into_inner();
+        let job = self.known(&caller, &job_id).await?;
+        let task = Some(task_id).filter(|task| !task.is_empty()).map(|task| task.parse()).transpose();
+        let task = task.map_err(ServiceError::from)?;
+        Ok(Response::new(history::of_job(&self.0, &job, task).await.map_err(ServiceError::from)?))
+    }
+
+    async fn share_job(
+        &self,
+        request: Request<v1::ShareJobRequest>,
+    ) -> Result<Response<v1::ShareJobResponse>, Status> {
+        let caller = caller(&request)?;
+        let v1::ShareJobRequest { job_id, expires_in_seconds } = request.into_inner();
+        let job = self.known(&caller, &job_id).await?;
+        Ok(Response::new(links::share(&self.0, &caller, job, expires_in_seconds).await?))
     }
 
     async fn list_artifacts(

@@ -5,6 +5,7 @@ mod backup;
 mod datasets;
 pub mod encode;
 mod jobs;
+pub mod links;
 pub mod logs;
 mod manifests;
 mod results;

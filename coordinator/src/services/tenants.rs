@@ -112,20 +112,24 @@ fn role(role: v1::Role) -> Option<Role> {
     }
 }
 
-fn token(record: &TokenRecord) -> v1::Token {
-    let role = match record.role {
+pub(super) fn encode_role(role: Role) -> v1::Role {
+    match role {
         Role::Viewer => v1::Role::Viewer,
         Role::Submitter => v1::Role::Submitter,
         Role::Operator => v1::Role::Operator,
         Role::Worker => v1::Role::Worker,
-    };
+    }
+}
+
+fn token(record: &TokenRecord) -> v1::Token {
     v1::Token {
         token_id: record.id.clone(),
         name: record.name.clone(),
-        role: role.into(),
+        role: encode_role(record.role).into(),
         tenant: record.tenant.as_ref().map(Tenant::to_string).unwrap_or_default(),
         create_time: Some(encode::timestamp(record.created_ms)),
         expire_time: record.expires_ms.map(encode::timestamp),
         revoke_time: record.revoked_ms.map(encode::timestamp),
+        job_id: record.job.as_ref().map(ToString::to_string).unwrap_or_default(),
     }
 }

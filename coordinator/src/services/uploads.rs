@@ -11,7 +11,7 @@ use futures::stream::{self, BoxStream};
 use futures::{Stream, StreamExt};
 use tonic::{Code, Request, Response, Status, Streaming, async_trait};
 
-use super::{datasets, encode};
+use super::{datasets, encode, links};
 use crate::access::guard::caller;
 use crate::access::{Principal, Role};
 use crate::metrics::Metrics;
@@ -351,6 +351,7 @@ impl UploadService for Uploads {
         let caller = caller(&request)?;
         let v1::ReadBlobRequest { digest, offset_bytes, job_id, direct } = request.into_inner();
         let objects = self.objects(&caller, &job_id).await?;
+        links::check_read(&self.0, &caller, &objects, &digest).await?;
         let metrics = Arc::clone(&self.0.metrics);
         Ok(Response::new(Self::read(objects, metrics, digest, offset_bytes, direct).await?))
     }

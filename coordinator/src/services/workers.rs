@@ -1,6 +1,7 @@
 //! WorkerService: leases.
 
 use std::collections::HashMap;
+use std::mem;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -155,7 +156,12 @@ impl Workers {
         for renewal in renewals {
             let lease = self.lease(caller, renewal.lease.clone()).await?;
             let progress = renewal.progress.as_ref().map(encode::live_progress);
-            let holds = self.0.jobs.renew(&lease, progress, self.0.clock.now_ms()).await?;
+            let now_ms = self.0.clock.now_ms();
+            let holds = self.0.jobs.renew(&lease, progress, now_ms).await?;
+            // Its last points may arrive behind its result.
+            if !renewal.measured.is_empty() && (holds != Renewed::Over || self.ended_it(&lease).await) {
+                self.0.history.add(&lease, renewal.measured, now_ms);
+            }
             let (verdict, reason) = verdict(holds, drains);
             outcomes.push(v1::RenewOutcome {
                 lease: renewal.lease,
@@ -185,7 +191,9 @@ impl Workers {
         let blob = encode::required_blob("result", request.result)?;
         let objects = self.objects(&lease).await?;
         results::check(&objects, lease.task.stage, &blob).await?;
-        let stats = request.stats.as_ref().map(encode::stats).unwrap_or_default();
+        let mut sent = request.stats.unwrap_or_default();
+        let measured = mem::take(&mut sent.measured);
+        let stats = encode::stats(&sent);
         let mut output = TaskOutput::of(lease.task.stage, blob, stats);
         for further in request.further {
             let made = encode::named_blob("further", further)?;
@@ -197,6 +205,7 @@ impl Workers {
             tracing::warn!(job = %lease.job, task = %lease.task, attempt = lease.attempt, fence = lease.fence, %error, "result refused");
         }
         result?;
+        self.0.history.add(&lease, measured, self.0.clock.now_ms());
         // Another worker may run a second attempt, which stops.
         let had_second_attempt =
             self.0.jobs.task_row(&lease.job, lease.task).await.is_ok_and(|row| row.second_attempts > 0);

@@ -485,6 +485,11 @@ impl AccessStore for MemoryStore {
         Ok(())
     }
 
+    async fn forget_token(&self, id: &str) -> Result<(), StoreError> {
+        self.lock().tokens.remove(id);
+        Ok(())
+    }
+
     async fn tokens(&self) -> Result<Vec<TokenRecord>, StoreError> {
         Ok(self.lock().tokens.values().cloned().collect())
     }

@@ -466,6 +466,8 @@ pub trait AccessStore: Send + Sync {
     async fn usage(&self) -> Result<Vec<(Tenant, Usage)>, StoreError>;
     /// Writes a token, replacing an earlier one with its id.
     async fn put_token(&self, token: &TokenRecord) -> Result<(), StoreError>;
+    /// Deletes the token of a link that has ended; others stay listed.
+    async fn forget_token(&self, id: &str) -> Result<(), StoreError>;
     /// All tokens, by id.
     async fn tokens(&self) -> Result<Vec<TokenRecord>, StoreError>;
     /// Ends the validity of a token, which stays listed; a repeated call does not move the time. Unless

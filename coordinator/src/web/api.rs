@@ -6,7 +6,7 @@ use axum::extract::State;
 use axum::http::{StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use axum::routing::{get, post};
-use fathom_proto::admin::v1::{ListTenantsRequest, ListWorkersRequest};
+use fathom_proto::admin::v1::{GetCallerRequest, ListTenantsRequest, ListWorkersRequest};
 use fathom_proto::v1;
 use serde::Deserialize;
 use serde_json::{Value, json};
@@ -36,10 +36,13 @@ pub fn router() -> Router<Web> {
         .route("/jobs/{job}/cancel", post(cancel_job))
         .route("/jobs/{job}/events", get(events::watch))
         .route("/jobs/{job}/logs", get(logs))
+        .route("/jobs/{job}/history", get(history))
+        .route("/jobs/{job}/share", post(share_job))
         .route("/jobs/{job}/files", get(files::list))
         .route("/jobs/{job}/files/{*path}", get(files::read))
         .route("/datasets", get(list_datasets))
         .route("/datasets/{dataset}", get(get_dataset))
+        .route("/caller", get(get_caller))
         .route("/workers", get(list_workers))
         .route("/tenants", get(list_tenants))
         .fallback(async || Fault::not_found("there is no such call; docs/operating/http.md lists them"))
@@ -213,6 +216,45 @@ async fn delete_job(
 
 #[derive(Debug, Default, Deserialize)]
 #[serde(default, deny_unknown_fields)]
+struct OfTask {
+    task: String,
+}
+
+async fn history(
+    State(web): State<Web>,
+    At(job_id): At<String>,
+    caller: Caller,
+    Asked(OfTask { task }): Asked<OfTask>,
+) -> Answer {
+    let request = v1::GetHistoryRequest { job_id, task_id: task };
+    let history = web.jobs().get_history(caller.asks(request)).await?.into_inner();
+    Ok(Json(json!({"tasks": history.tasks.iter().map(json::task_history).collect::<Vec<_>>()})))
+}
+
+#[derive(Debug, Default, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+struct Share {
+    expires_in_seconds: u64,
+}
+
+async fn share_job(
+    State(web): State<Web>,
+    At(job_id): At<String>,
+    caller: Caller,
+    Said(Share { expires_in_seconds }): Said<Share>,
+) -> Result<Response, Fault> {
+    let request = v1::ShareJobRequest { job_id, expires_in_seconds };
+    let link = web.jobs().share_job(caller.asks(request)).await?.into_inner();
+    let value = json!({
+        "token": link.secret,
+        "token_id": link.token_id,
+        "expires_unix_seconds": json::unix_seconds(&link.expire_time),
+    });
+    Ok((StatusCode::CREATED, Json(value)).into_response())
+}
+
+#[derive(Debug, Default, Deserialize)]
+#[serde(default, deny_unknown_fields)]
 struct Lines {
     task: String,
     attempt: u32,
@@ -286,6 +328,11 @@ async fn list_datasets(
 async fn get_dataset(State(web): State<Web>, At(dataset_id): At<String>, caller: Caller) -> Answer {
     let request = v1::GetDatasetRequest { dataset_id };
     Ok(Json(json::dataset(web.uploads().get_dataset(caller.asks(request)).await?.get_ref())))
+}
+
+async fn get_caller(State(web): State<Web>, caller: Caller) -> Answer {
+    let known = web.admin().get_caller(caller.asks(GetCallerRequest {})).await?.into_inner();
+    Ok(Json(json::caller(&known)))
 }
 
 async fn list_workers(State(web): State<Web>, caller: Caller) -> Answer {

@@ -15,10 +15,12 @@ use std::io;
 use std::sync::Arc;
 
 use axum::Router;
+use axum::body::Body;
 use axum::extract::{Request, State};
 use axum::http::{HeaderValue, StatusCode, header};
 use axum::middleware::{Next, from_fn, from_fn_with_state};
-use axum::response::Response;
+use axum::response::{IntoResponse, Response};
+use axum::routing::get;
 use fathom_proto::admin::v1::admin_service_client::AdminServiceClient;
 use fathom_proto::v1::job_service_client::JobServiceClient;
 use fathom_proto::v1::upload_service_client::UploadServiceClient;
@@ -76,6 +78,7 @@ pub async fn serve<I, C>(
     incoming: I,
     door: Door,
     guard: Arc<Guard>,
+    is_own_page: bool,
     stopped: impl Future<Output = ()>,
 ) -> Result<(), tonic::transport::Error>
 where
@@ -89,20 +92,24 @@ where
         .http2_keepalive_timeout(Some(KEEPALIVE_TIMEOUT))
         .max_concurrent_streams(MAX_CALLS_OF_A_CONNECTION)
         .tcp_nodelay(true)
-        .add_routes(Routes::from(router(Web { door, guard })))
+        .add_routes(Routes::from(router(Web { door, guard }, is_own_page)))
         .serve_with_incoming_shutdown(incoming, stopped)
         .await
 }
 
-fn router(web: Web) -> Router {
+fn router(web: Web, is_own_page: bool) -> Router {
     let calls = GrpcWebLayer::new().layer(web.door.clone());
     let mut router = Router::new()
         .nest("/api/v1", api::router().layer(from_fn_with_state(web.clone(), with_token)))
+        .route("/", get(page))
+        .route("/assets/{*file}", get(page))
+        .route("/licences.txt", get(page))
         .fallback(no_such_page);
     for service in SERVICES {
         router = router.route_service(&format!("/{service}/{{method}}"), calls.clone());
     }
-    let asks_for_tokens = web.guard.access.asks_for_tokens();
+    // The page of a run is always reached by an IP address.
+    let asks_for_tokens = web.guard.access.asks_for_tokens() && !is_own_page;
     router
         .layer(from_fn(move |request, next| of_this_site(asks_for_tokens, request, next)))
         // Outermost, so that refusals have them too.
@@ -147,14 +154,30 @@ async fn of_this_site(asks_for_tokens: bool, request: Request, next: Next) -> Re
     }
 }
 
+/// A file of the page. It holds nothing of the service, so it needs no token.
+async fn page(request: Request) -> Response {
+    if let Some(visit) = Visit::of(&request) {
+        visit.call_without_token();
+    }
+    let path = request.uri().path().trim_start_matches('/');
+    let path = if path.is_empty() { "index.html" } else { path };
+    match fathom_web::page(path, request.headers()) {
+        Some(page) => page.map(Body::from),
+        None => Fault::not_found("there is no such file of the page; begin at /").into_response(),
+    }
+}
+
 async fn no_such_page(request: Request) -> Fault {
     if let Some(visit) = Visit::of(&request) {
         visit.call_without_token();
     }
-    Fault::not_found("there is nothing at this address; the interface begins at /api/v1/jobs")
+    Fault::not_found(
+        "there is nothing at this address; the page is at /, the interface for scripts at /api/v1/jobs",
+    )
 }
 
-/// Headers for browsers: no answer is a page that may run anything, be framed, or be kept.
+/// Headers for browsers: no answer may run anything, be framed, or be kept. The files of the page have
+/// headers of their own.
 async fn guard_headers(request: Request, next: Next) -> Response {
     let mut answer = next.run(request).await;
     let headers = answer.headers_mut();

@@ -356,6 +356,7 @@ impl JobConfig {
             "train.eval_every needs held-out views, but data.test_every = 0 holds none out",
         );
         require(t.checkpoint_seconds >= 1, "train.checkpoint_seconds must be at least 1");
+        require(t.preview_views <= 8, "train.preview_views must be at most 8");
         require(
             d.metres_per_unit >= 0.0 && d.metres_per_unit.is_finite(),
             "data.metres_per_unit must be a finite number above 0, or 0 if it is not known",

@@ -175,6 +175,13 @@ pub struct TrainConfig {
     pub eval_every: u32,
     /// Seconds between checkpoints. Default 30.
     pub checkpoint_seconds: u32,
+    /// Seconds between previews: small pictures of `preview_views` held-out views, which show how far a run
+    /// is. Default 30. 0 makes none. The pauses grow to an eighth of the time that a run has taken. Training
+    /// does not depend on previews.
+    pub preview_seconds: u32,
+    /// Held-out views of each run in previews, at most 8. Default 2. A partition takes those whose cameras
+    /// are closest to the middle of its own cameras.
+    pub preview_views: u32,
     /// Thresholds and times of `classic`.
     pub classic: ClassicConfig,
     /// Factor on the whole loss. Default 1. Set by a task, never by a user (`partition.weights =
@@ -219,6 +226,8 @@ impl Default for TrainConfig {
             prefetch_threads: 1,
             eval_every: 0,
             checkpoint_seconds: 30,
+            preview_seconds: 30,
+            preview_views: 2,
             classic: ClassicConfig::default(),
             loss_factor: 1.0,
         }

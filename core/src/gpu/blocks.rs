@@ -364,6 +364,28 @@ impl Blocks {
         Ok(model)
     }
 
+    /// The same Gaussians, to be rendered: all their buffers are shared, so that a run can be rendered
+    /// without a copy of its model. Valid until the Gaussians of the run are moved or increased.
+    ///
+    /// # Errors
+    /// When the device fails.
+    pub fn sharing_all(&self, gpu: &Gpu) -> Result<Self> {
+        let mut shared = Self::new(gpu, self.sh_degree)?;
+        let same = |block: &Block| Block {
+            capacity: block.capacity,
+            count: block.count,
+            uniform: gpu.uniform("block", &BlockUniform::default()),
+            transforms: block.transforms.clone(),
+            sh_coeffs: block.sh_coeffs.clone(),
+            chunk_seen: block.chunk_seen.clone(),
+            bounds: block.bounds.clone(),
+            training: None,
+        };
+        shared.blocks.extend(self.blocks.iter().map(same));
+        shared.write_uniforms(gpu);
+        Ok(shared)
+    }
+
     /// The same Gaussians, sharing their transforms on the device, with coefficients of degree 0 of their
     /// own, all 0. For images of quantities other than the model's colours.
     ///

@@ -165,6 +165,18 @@ impl Renderer {
         Ok(Self { gpu, blocks, recoloured: None, frame, order, options })
     }
 
+    /// Renders the Gaussians of a run where they are, without a copy of them.
+    ///
+    /// # Errors
+    /// When the device fails.
+    pub(crate) fn of_run(gpu: Arc<Gpu>, run: &Blocks) -> Result<Self> {
+        let blocks = run.sharing_all(&gpu)?;
+        let count = blocks.total();
+        let frame = Frame::new(&gpu, count, count.clamp(1024, 65_536), count.clamp(4096, 262_144))?;
+        let options = RenderOptions { strip_tiles: MAX_TILES, mip_filter: false, water: None, bands: 1 };
+        Ok(Self { gpu, blocks, recoloured: None, frame, order: Vec::new(), options })
+    }
+
     /// Renders with or without the 2D filter of Mip-Splatting: as the model was trained
     /// ([`crate::ply::is_antialiased`]).
     #[must_use]

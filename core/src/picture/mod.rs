@@ -117,6 +117,20 @@ pub fn encode_png(width: u32, height: u32, rgb: &[u8]) -> Result<Vec<u8>> {
     encode(width, height, rgb, image::ExtendedColorType::Rgb8)
 }
 
+/// A JPEG of 8-bit RGB pixels, three bytes each, for previews.
+///
+/// # Errors
+/// When `rgb` does not have `width * height * 3` bytes.
+pub fn encode_jpeg(width: u32, height: u32, rgb: &[u8]) -> Result<Vec<u8>> {
+    const QUALITY: u8 = 85;
+    check_size("JPEG", width, height, rgb, image::ExtendedColorType::Rgb8)?;
+    let mut jpeg = Vec::new();
+    image::codecs::jpeg::JpegEncoder::new_with_quality(&mut jpeg, QUALITY)
+        .write_image(rgb, width, height, image::ExtendedColorType::Rgb8)
+        .map_err(|error| CoreError::Scene(format!("a JPEG of {width}x{height} pixels: {error}")))?;
+    Ok(jpeg)
+}
+
 /// A PNG of 8-bit grey pixels, one byte each.
 ///
 /// # Errors
@@ -125,14 +139,25 @@ pub fn encode_grey_png(width: u32, height: u32, grey: &[u8]) -> Result<Vec<u8>> 
     encode(width, height, grey, image::ExtendedColorType::L8)
 }
 
-fn encode(width: u32, height: u32, pixels: &[u8], colour: image::ExtendedColorType) -> Result<Vec<u8>> {
+fn check_size(
+    format: &str,
+    width: u32,
+    height: u32,
+    pixels: &[u8],
+    colour: image::ExtendedColorType,
+) -> Result<()> {
     let expected = u64::from(width) * u64::from(height) * u64::from(colour.channel_count());
-    if pixels.len() as u64 != expected {
-        return Err(CoreError::Scene(format!(
-            "a PNG of {width}x{height} pixels needs {expected} bytes, but {} were given",
-            pixels.len()
-        )));
+    if pixels.len() as u64 == expected {
+        return Ok(());
     }
+    Err(CoreError::Scene(format!(
+        "a {format} of {width}x{height} pixels needs {expected} bytes, but {} were given",
+        pixels.len()
+    )))
+}
+
+fn encode(width: u32, height: u32, pixels: &[u8], colour: image::ExtendedColorType) -> Result<Vec<u8>> {
+    check_size("PNG", width, height, pixels, colour)?;
     let mut png = Vec::new();
     image::codecs::png::PngEncoder::new(&mut png)
         .write_image(pixels, width, height, colour)

@@ -5,6 +5,7 @@
 //! G, then B). Opacity is a logit, scales are logarithms, rotation is w x y z. Values are written exactly as
 //! trained, except that quaternions are normalised.
 
+mod compressed;
 pub(crate) mod header;
 mod read;
 mod rows;
@@ -12,6 +13,7 @@ mod write;
 
 use std::fmt::Write as _;
 
+pub use compressed::{CompressedCopy, compressed};
 pub use read::{SplatReader, SplatRow, from_bytes, is_antialiased, read_model, water_record};
 /// Header comment of a model that was trained with the 2D filter of Mip-Splatting and must be rendered with
 /// it.

@@ -23,11 +23,13 @@ const HEADER: usize = 8 + 4 + 32 + 3 * 4;
 /// BLAKE3 of configuration, extent, water, views, focus, context and surfaces.
 pub(super) fn run_digest(run: &TrainRun) -> [u8; 32] {
     let mut hasher = blake3::Hasher::new();
-    // The result does not depend on the checkpoint interval, the prefetch threads or the evaluation interval.
+    // The result does not depend on when checkpoints, measurements and previews are made, or on prefetching.
     let config = crate::config::TrainConfig {
         checkpoint_seconds: 0,
         prefetch_threads: 0,
         eval_every: 0,
+        preview_seconds: 0,
+        preview_views: 0,
         ..run.config.clone()
     };
     hasher.update(format!("{config:?} {:08x}", run.extent.to_bits()).as_bytes());

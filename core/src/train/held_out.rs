@@ -1,4 +1,4 @@
-//! Metrics on held-out views during training.
+//! Metrics on held-out views during training, and previews.
 //!
 //! The protocol is that of the final evaluation: renders over black without an exposure, clamped and rounded
 //! to 8 bits in sRGB. Training does not depend on these metrics.
@@ -7,8 +7,9 @@ use std::sync::Arc;
 
 use super::Trainer;
 use crate::Result;
-use crate::gpu::Renderer;
+use crate::gpu::{Output, Renderer, WaterView};
 use crate::metrics::{psnr, quantised, ssim};
+use crate::scene::{PinholeCamera, Pose};
 use crate::views::ViewSource;
 
 /// Means over the held-out views at one iteration.
@@ -25,7 +26,54 @@ pub struct HeldOutMetrics {
     pub views: u32,
 }
 
+/// A small picture of a view, as the run sees it now.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Preview {
+    /// Columns.
+    pub width: u32,
+    /// Rows.
+    pub height: u32,
+    /// As the camera sees it, under water if there is any: sRGB, three bytes a pixel.
+    pub render: Vec<u8>,
+    /// The same without the water; `None` where there is none.
+    pub clear: Option<Vec<u8>>,
+}
+
 impl Trainer {
+    /// Renders everything that the run sees, its context included, with these cameras; ends early when
+    /// `go_on`, which is called before each picture, returns false. The 3D filter of Mip-Splatting is left
+    /// out. Training does not depend on it.
+    ///
+    /// # Errors
+    /// When the device fails, or has no memory for the lists of a picture.
+    pub fn preview(
+        &mut self,
+        cameras: &[(PinholeCamera, Pose)],
+        go_on: impl Fn() -> bool,
+    ) -> Result<Vec<Preview>> {
+        let water = self.water_view()?;
+        let mut renderer =
+            Renderer::of_run(Arc::clone(&self.gpu), &self.blocks)?.with_mip_filter(self.config.mip_filter);
+        let mut previews = Vec::with_capacity(cameras.len());
+        for (camera, pose) in cameras {
+            if !go_on() {
+                break;
+            }
+            let mut through = |water: Option<WaterView>| -> Result<Vec<u8>> {
+                renderer.set_water(water);
+                let rendered = renderer.render(camera, pose, [0.0; 3])?;
+                Ok(quantised(rendered.width, rendered.height, &rendered.rgb).to_rgb8())
+            };
+            let render = through(water)?;
+            let restored = water.map(|water| WaterView { output: Output::Restored, ..water });
+            let clear = restored.map(|restored| through(Some(restored))).transpose()?;
+            previews.push(Preview { width: camera.width, height: camera.height, render, clear });
+        }
+        drop(renderer);
+        self.gpu.release_unused()?;
+        Ok(previews)
+    }
+
     /// Renders the current Gaussians in focus from the `held_out` views and compares. `None` if there are no
     /// views, or if `go_on`, which is called before each view, returns false.
     ///

@@ -44,7 +44,7 @@ pub use crate::appearance::water::{
 pub use crate::gpu::DevicePhotograph;
 pub use backward::{BackwardBuffers, record_backward, record_backward_in_bands};
 pub use handover::Surroundings;
-pub use held_out::HeldOutMetrics;
+pub use held_out::{HeldOutMetrics, Preview};
 pub use init::initial_gaussians;
 use lists::{lists, slot_gradients};
 pub use loss::Loss;

@@ -57,7 +57,7 @@ pub fn photographs_from(
 }
 
 /// The start of training: the true model moved, faded and grey.
-fn start() -> Gaussians {
+pub fn start() -> Gaussians {
     let mut model = truth();
     for (i, mean) in model.means.iter_mut().enumerate() {
         mean.iter_mut()

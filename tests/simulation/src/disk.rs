@@ -518,6 +518,10 @@ impl AccessStore for DiskStore {
         self.change(|()| true, self.memory.put_token(token)).await
     }
 
+    async fn forget_token(&self, id: &str) -> Result<(), StoreError> {
+        self.change(|()| true, self.memory.forget_token(id)).await
+    }
+
     async fn tokens(&self) -> Result<Vec<TokenRecord>, StoreError> {
         self.look(self.memory.tokens()).await
     }

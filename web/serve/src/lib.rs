@@ -3,6 +3,7 @@
 //! Files are compressed with gzip, which every browser accepts over plain HTTP too. They are sent as they
 //! are. A client that does not accept gzip gets them decompressed.
 
+mod handover;
 mod same_site;
 
 use std::io::Read as _;
@@ -13,6 +14,7 @@ use http::header::{self, HeaderMap, HeaderName, HeaderValue};
 use http::{Response, StatusCode};
 use rust_embed::Embed;
 
+pub use handover::{Handover, handover_template};
 pub use same_site::{Refused, check};
 
 #[derive(Embed)]
@@ -28,7 +30,8 @@ pub const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self
 /// A file of the pages by its path below `web/dist`, such as `view.html`, as the answer to a request with
 /// these headers; `None` if there is none.
 pub fn page(path: &str, asked: &HeaderMap) -> Option<Response<Bytes>> {
-    let packed = Dist::get(&format!("{path}.gz"))?.data;
+    // It is a form for `Handover`, not a page of a server.
+    let packed = Dist::get(&format!("{path}.gz")).filter(|_| path != "handover.html")?.data;
     let accepts =
         asked.get(header::ACCEPT_ENCODING).and_then(|value| value.to_str().ok()).unwrap_or_default();
     let as_it_is = accepts.split(',').any(|word| word.trim().split(';').next() == Some("gzip"));
@@ -89,6 +92,9 @@ mod tests {
         let mut count = 0;
         for name in Dist::iter() {
             let name = name.strip_suffix(".gz").unwrap();
+            if name == "handover.html" {
+                continue;
+            }
             let (packed, plain) = (page(name, &gzip).unwrap(), page(name, &HeaderMap::new()).unwrap());
             assert_eq!(packed.headers()[header::CONTENT_ENCODING], "gzip");
             assert!(!plain.headers().contains_key(header::CONTENT_ENCODING));
@@ -104,13 +110,15 @@ mod tests {
 
     #[test]
     fn a_page_names_only_scripts_and_styles_that_are_there() {
-        let html = page("view.html", &HeaderMap::new()).unwrap();
-        let html = std::str::from_utf8(html.body()).unwrap();
-        let named: Vec<_> = html.split('"').filter_map(|word| word.strip_prefix("./")).collect();
-        assert!(named.len() >= 2, "{html}");
-        for name in named {
-            assert!(page(name, &HeaderMap::new()).is_some(), "{name}");
+        for name in ["index.html", "view.html"] {
+            let html = page(name, &HeaderMap::new()).unwrap();
+            let html = std::str::from_utf8(html.body()).unwrap();
+            let named: Vec<_> = html.split('"').filter_map(|word| word.strip_prefix("./")).collect();
+            assert!(named.len() >= 2, "{html}");
+            for file in named {
+                assert!(page(file, &HeaderMap::new()).is_some(), "{name}: {file}");
+            }
+            assert!(!html.contains("http://") && !html.contains("https://"), "fetched from elsewhere");
         }
-        assert!(!html.contains("http://") && !html.contains("https://"), "nothing is fetched from elsewhere");
     }
 }

@@ -35,7 +35,11 @@ export class Fragment {
         clearTimeout(this.#timer);
         this.#timer = window.setTimeout(() => {
             this.#written = fragmentOf(this.#viewer.saved(), this.#viewer.bookmarks);
-            history.replaceState(history.state, '', `#${this.#written}`);
+            try {
+                history.replaceState(history.state, '', `#${this.#written}`);
+            } catch {
+                // Some browsers refuse this for a page from the disk: then its address holds no view.
+            }
         }, 400);
     }
 }

@@ -10,6 +10,9 @@ export async function fetched(path: string, fetchFile: FetchFile): Promise<Respo
     try {
         response = await fetchFile(path);
     } catch (error) {
+        if (error instanceof ViewerError) {
+            throw error;
+        }
         throw new ViewerError(`${path} cannot be fetched: no answer.`, 'Check the connection and reload the page.', error);
     }
     if (!response.ok) {

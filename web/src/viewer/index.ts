@@ -5,12 +5,13 @@ import { type View, pinholeOf, poseOf } from './camera.ts';
 import { h } from './dom.ts';
 import { download, megabytes } from './download.ts';
 import { ViewerError, explained } from './errors.ts';
-import type { RightSide } from './link.ts';
+import { type RightSide, readFragment } from './link.ts';
 import { drawMarks } from './marks.ts';
 import { Panel } from './panel.ts';
 import { partitionsOf } from './partitions.ts';
 import { Photographs } from './photographs.ts';
 import { frameAmong, isAntialiased, isInLinearLight, isPly, readHeader, waterAmong } from './ply.ts';
+import { spreadOver } from './presets.ts';
 import { type Mode, Renderer } from './renderer.ts';
 import { type CameraEntry, type FetchFile, type Scene, checkScene } from './scene.ts';
 import { Sorter } from './sorter.ts';
@@ -29,7 +30,14 @@ export { checkScene } from './scene.ts';
 export interface Options {
     /** Keeps the view in the fragment of the page's address, so that links hold it. Off by default. */
     readonly useFragment?: boolean;
+    /** Views to begin with: the fragment of a link to the viewer, with its bookmarks. */
+    readonly views?: string;
+    /** Without bookmarks in `views`, offers some cameras of photographs as "View 1", "View 2" and so on. */
+    readonly suggestsViews?: boolean;
 }
+
+/** How many views are suggested. */
+const SUGGESTED = 6;
 
 /**
  * A viewer that is open. It is also the property `fathomViewer` of the container, so that tests and scripts
@@ -171,6 +179,11 @@ async function open(
     viewer = new Viewer(scene, water, canvas, renderer, sorter, inScene, hasPartitions);
     const gaussians = centres.length / 3;
     const opened = viewer;
+    const begin = readFragment(options.views ?? '');
+    opened.bookmarks = begin.bookmarks;
+    if (options.suggestsViews === true && begin.bookmarks.length === 0) {
+        opened.suggested = spreadOver(opened.cameras, SUGGESTED).map(({ img_name }) => img_name);
+    }
 
     const panel = new Panel(opened, {
         hasLinks: options.useFragment === true,
@@ -195,6 +208,9 @@ async function open(
     const colour = (): void => opened.setBackground(backgroundOf(root));
     dark.addEventListener('change', colour, { signal: stop.signal });
     colour();
+    if (begin.view !== null) {
+        opened.show(begin.view);
+    }
     fragment?.read();
     void photographs.update();
     await opened.settled();

@@ -124,7 +124,17 @@ export class Panel {
     }
 
     updateViews(): void {
-        const { bookmarks } = this.#viewer;
+        const { bookmarks, suggested } = this.#viewer;
+        const suggestion = (photograph: string, i: number): HTMLElement =>
+            h(
+                'li',
+                { class: 'fv-view' },
+                h(
+                    'button',
+                    { type: 'button', class: 'fv-entry', onclick: () => this.#viewer.goToPhotograph(photograph) },
+                    `View ${i + 1}`,
+                ),
+            );
         const remove = (bookmark: Bookmark): void => {
             this.#viewer.bookmarks = this.#viewer.bookmarks.filter((other) => other !== bookmark);
             this.updateViews();
@@ -146,8 +156,8 @@ export class Panel {
                     'Remove',
                 ),
             );
-        this.#views.replaceChildren(...bookmarks.map(entry));
-        this.#views.hidden = bookmarks.length === 0;
+        this.#views.replaceChildren(...suggested.map(suggestion), ...bookmarks.map(entry));
+        this.#views.hidden = bookmarks.length + suggested.length === 0;
     }
 
     #nameOf(mode: Mode): string {
@@ -304,7 +314,7 @@ export class Panel {
         const id = freshId();
         const name = h('input', { id, type: 'text', maxlength: 60, autocomplete: 'off', placeholder: 'Stern from port' });
         const save = (): void => {
-            const bookmark = { name: name.value.trim() || `View ${viewer.bookmarks.length + 1}`, view: viewer.saved() };
+            const bookmark = { name: name.value.trim() || `View ${viewer.suggested.length + viewer.bookmarks.length + 1}`, view: viewer.saved() };
             viewer.bookmarks = [...viewer.bookmarks, bookmark];
             name.value = '';
             this.updateViews();

@@ -111,6 +111,8 @@ interface Model {
     readonly order: Texture;
     readonly partitions: Texture | null;
     readonly antialiased: boolean;
+    /** Coefficients of the harmonics beyond the constant one, by channel. */
+    readonly harmonics: number;
     count: number;
 }
 
@@ -216,6 +218,7 @@ export class Renderer {
         this.#toModel = toModel;
         const material = new ShaderMaterial({ uniqueName: 'FathomFormat', vertexGLSL: '', fragmentGLSL: '' } as never);
         resource.configureMaterial(material, null, resource.format.getInputDeclarations());
+        const { shBands } = resource.gsplatData as { readonly shBands?: number };
         const width = Math.min(2048, this.#device.maxTextureSize);
         const height = Math.ceil(resource.numSplats / width);
         this.#model = {
@@ -225,6 +228,7 @@ export class Renderer {
             order: this.#texture('order', PIXELFORMAT_R32U, width, height),
             partitions: null,
             antialiased,
+            harmonics: [0, 3, 8, 15][shBands ?? 3] ?? 15,
             count: 0,
         };
         return centres;
@@ -455,6 +459,7 @@ export class Renderer {
             (camera.height - camera.cy + my) / camera.fy,
         ]);
         this.#set('uAntialiased', model.antialiased ? 1 : 0);
+        this.#set('uHarmonics', model.harmonics);
         this.#set('uPaint', paintOf(mode, compositionOf(this.#water)));
         const times = (v: Vec3 | undefined): number[] => (v ?? [0, 0, 0]).map((value) => value * frame.amount);
         this.#set('uBetaD', times(this.#water?.beta_d));

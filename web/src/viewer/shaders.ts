@@ -63,6 +63,8 @@ uniform vec2 uSize;
 // Bounds of x/z and y/z inside the Jacobian: minimum, maximum.
 uniform vec4 uRatio;
 uniform int uAntialiased;
+// Harmonics that the file has. Of a compressed PLY the engine gives 15; it fills the others with a code near 0.
+uniform int uHarmonics;
 uniform int uPaint;
 // Water that acts on Gaussians, already scaled by the amount of water.
 uniform vec3 uBetaD;
@@ -183,6 +185,9 @@ void main(void) {
         vec3 sh[SH_COEFFS];
         float shScale;
         readSHData(sh, shScale);
+        for (int k = 0; k < SH_COEFFS; k++) {
+            sh[k] = k < uHarmonics ? sh[k] : vec3(0.0);
+        }
         colour.rgb += evalSH(sh, normalize(mean - uEye)) * shScale;
     #endif
 

@@ -2,6 +2,7 @@
 
 import { type Pinhole, type Pose, worldToCamera } from './camera.ts';
 import type { FromWorker, ToWorker } from './sort-worker.ts';
+import { startSorting } from './start-sorting.ts';
 
 export type Sorted = FromWorker;
 
@@ -21,7 +22,7 @@ export class Sorter {
     lastMilliseconds = 0;
 
     constructor(centres: Float32Array) {
-        this.#worker = new Worker(new URL('sort-worker.ts', import.meta.url), { type: 'module' });
+        this.#worker = startSorting();
         this.#worker.addEventListener('message', (event: MessageEvent<FromWorker>) => this.#finish(event.data));
         this.#send({ kind: 'centres', centres });
     }

@@ -81,6 +81,8 @@ export class Viewer {
     readonly canvas: HTMLCanvasElement;
     state: State;
     bookmarks: Bookmark[] = [];
+    /** Photographs whose cameras are offered as views. */
+    suggested: readonly string[] = [];
     /** 2nd and 98th percentile of the ranges in the picture, scene units. */
     rangeScale: readonly [number, number] = [0, 1];
     /** Called after each change of the state. */

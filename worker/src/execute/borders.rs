@@ -55,7 +55,7 @@ pub fn run(
     let mut trainer = open(gpu, task, run)?;
     let span = Span::of(&task.common);
     let resumed_from = span.done(trainer.progress().iteration);
-    advance(&mut trainer, &config, span, task.held_out()?.as_ref(), control)?;
+    advance(task, &mut trainer, &config, span, control)?;
     let trained = trainer.gaussians()?;
     // Free the device while the model is written and uploaded.
     drop(trainer);

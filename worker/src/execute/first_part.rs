@@ -49,7 +49,7 @@ pub fn run(
     let mut trainer = open(gpu, task, first_run(task, &own)?)?;
     let span = Span::of(&task.common);
     let resumed_from = span.done(trainer.progress().iteration);
-    let held_out = advance(&mut trainer, &own.config, span, task.held_out()?.as_ref(), control)?;
+    let held_out = advance(task, &mut trainer, &own.config, span, control)?;
     let found = if refines_water(task) { Some(found_water(&trainer)?) } else { None };
     let gaussians = trainer.progress().gaussians;
     let cell = spec.cell.as_ref();
@@ -117,7 +117,7 @@ pub fn run_rest(
     go_on(task, &mut trainer)?;
     let span = Span::of(&task.common);
     let resumed_from = span.done(trainer.progress().iteration);
-    let held_out = advance(&mut trainer, &own.config, span, task.held_out()?.as_ref(), control)?;
+    let held_out = advance(task, &mut trainer, &own.config, span, control)?;
     finish(task, &mut trainer, &own.config, &own.parts.shared, water, resumed_from, held_out)
 }
 

@@ -6,6 +6,7 @@ mod first_part;
 mod global;
 mod loss_mask;
 mod partition;
+mod previews;
 #[cfg(test)]
 mod tests;
 mod training;
@@ -27,6 +28,7 @@ use fathom_proto::worker::v1::{
 };
 use futures::future::BoxFuture;
 
+pub use self::previews::Picture;
 use crate::WorkerError;
 pub use crate::heartbeat::Stop;
 use crate::views::{PhotographFile, PhotographSource};
@@ -261,6 +263,9 @@ impl From<CoreError> for TaskError {
 pub trait Control: Send + Sync {
     /// Reports progress.
     fn report(&self, progress: Progress);
+    /// Submits previews of an iteration. They are uploaded in the background; later ones replace those that
+    /// still wait.
+    fn preview(&self, _iteration: u32, _pictures: Vec<Picture>) {}
     /// Submits a checkpoint. It is uploaded in the background; a later one replaces it if it still waits.
     fn checkpoint(&self, bytes: Bytes, iteration: u32);
     /// Whether the task must stop, and how.

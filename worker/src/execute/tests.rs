@@ -1,6 +1,7 @@
 //! Tests tasks on a real device: too little memory, a lost device, a panic, and a partition in two tasks.
 
 mod borders;
+mod previews;
 
 use std::collections::BTreeMap;
 use std::panic::{AssertUnwindSafe, catch_unwind};

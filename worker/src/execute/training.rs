@@ -20,6 +20,7 @@ use fathom_core::water::WaterRecord;
 use fathom_proto::v1::{self, Progress};
 use fathom_proto::worker::v1::CommonSpec;
 
+use super::previews::Previews;
 use super::{Control, Stop, TaskError, TaskInput, TaskOutput};
 
 /// Device time between two checks of the control.
@@ -142,7 +143,7 @@ pub fn train(
     let mut run = method::start(task.config.method, Arc::clone(gpu), run)?;
     go_on(task, run.as_mut())?;
     let resumed_from = span.done(run.progress().iteration);
-    let history = advance(run.as_mut(), &config, span, task.held_out()?.as_ref(), control)?;
+    let history = advance(task, run.as_mut(), &config, span, control)?;
     finish(task, run.as_mut(), &config, &shared, water, resumed_from, history)
 }
 
@@ -196,14 +197,17 @@ pub fn go_on(task: &TaskInput, run: &mut dyn Run) -> Result<(), TaskError> {
     Ok(())
 }
 
-/// Trains to the end of `span`; returns the measurements on `held_out`.
+/// Trains to the end of `span`; returns the measurements on the task's held-out views.
 pub fn advance(
+    task: &TaskInput,
     run: &mut dyn Run,
     config: &TrainConfig,
     span: Span,
-    held_out: &dyn ViewSource,
     control: &dyn Control,
 ) -> Result<Vec<v1::HeldOutMetrics>, TaskError> {
+    let held_out = task.held_out()?;
+    let held_out = held_out.as_ref();
+    let mut previews = Previews::of(task, config);
     let mut cadence =
         Cadence::new(run.progress().iteration.saturating_sub(span.from), config.checkpoint_seconds);
     let eval_every = if held_out.views().is_empty() { 0 } else { config.eval_every };
@@ -232,6 +236,7 @@ pub fn advance(
             loss: progress.loss,
             iterations_per_second,
             held_out: history.last().copied(),
+            ..Progress::default()
         };
         control.report(report);
         if eval_every > 0
@@ -243,6 +248,9 @@ pub fn advance(
             history.push(v1::HeldOutMetrics { iteration, psnr_db, ssim, views });
             report.held_out = history.last().copied();
             control.report(report);
+        }
+        if let Some(pictures) = previews.make(run, &|| control.stop_reason().is_none()) {
+            control.preview(report.iteration, pictures);
         }
         stretch = ((iterations_per_second * LOOK_EVERY.as_secs_f32()) as u32).clamp(1, LONGEST_STRETCH);
         if cadence.is_due(progress.iteration.saturating_sub(span.from), span.length()) {

@@ -15,13 +15,14 @@ use tokio::sync::{Mutex, watch};
 use tonic::async_trait;
 
 use super::super::StoreError;
+use super::histories;
 use super::rows::{number, parse_job, part, stage, task_of};
 use super::{Borrowed, Inner, PostgresStore, unavailable};
 use crate::logs::{
     ATTEMPTS_KEPT, Attempt, COPIED_SEGMENT_BYTES, KeptLine, LOOKED_AT, LogError, Logs, NewLine, Page,
     Position, Row, SEGMENTS, Severity, Wanted,
 };
-use crate::schedule::JobId;
+use crate::schedule::{JobId, TaskId};
 
 /// Bytes of a line besides its text, with its part of the indexes.
 const LINE_BYTES: u64 = 256;
@@ -102,6 +103,14 @@ impl Logs for PostgresLogs {
         limit: usize,
     ) -> Result<Page, LogError> {
         Ok(on!(self.store, pool, |conn| read(conn, job, wanted, position, limit))?)
+    }
+
+    async fn put_history(&self, job: &JobId, task: TaskId, history: Vec<u8>) -> Result<(), LogError> {
+        Ok(on!(self.store, renewals, |conn| histories::put(conn, job, task, &history))?)
+    }
+
+    async fn histories(&self, job: &JobId, task: Option<TaskId>) -> Result<Vec<(TaskId, Vec<u8>)>, LogError> {
+        Ok(on!(self.store, pool, |conn| histories::read(conn, job, task))?)
     }
 
     async fn remove(&self, job: &JobId) -> Result<(), LogError> {
@@ -501,6 +510,7 @@ async fn remove(conn: &mut PgConnection, job: &JobId) -> Result<(), StoreError> 
         "DELETE FROM log_jobs WHERE job_id = $1",
         "DELETE FROM log_attempts WHERE job_id = $1",
         "DELETE FROM log_lines WHERE job_id = $1",
+        "DELETE FROM histories WHERE job_id = $1",
     ] {
         sqlx::query(delete).bind(job.as_str()).execute(&mut *tx).await.map_err(unavailable)?;
     }
@@ -508,10 +518,8 @@ async fn remove(conn: &mut PgConnection, job: &JobId) -> Result<(), StoreError> 
 }
 
 async fn jobs(conn: &mut PgConnection) -> Result<Vec<JobId>, StoreError> {
-    let jobs: Vec<String> = sqlx::query_scalar("SELECT job_id FROM log_jobs ORDER BY job_id")
-        .fetch_all(conn)
-        .await
-        .map_err(unavailable)?;
+    let all = "SELECT job_id FROM log_jobs UNION SELECT job_id FROM histories ORDER BY job_id";
+    let jobs: Vec<String> = sqlx::query_scalar(all).fetch_all(conn).await.map_err(unavailable)?;
     jobs.iter().map(|job| parse_job(job)).collect()
 }
 

@@ -11,7 +11,7 @@
 //! | `tenants`, `datasets` | quotas, tokens, datasets |
 //! | `ledger` | the blobs of a bucket |
 //! | `members` | the coordinators that use the database, and their workers |
-//! | `logs` | log lines |
+//! | `logs`, `histories` | log lines, and histories of tasks |
 //! | `whole` | export, import, verification |
 //! | `rows`, `locks` | columns, and locks on things that are not rows |
 //!
@@ -37,6 +37,7 @@ macro_rules! on {
 mod batch;
 mod claims;
 mod datasets;
+mod histories;
 mod jobs;
 mod leases;
 mod ledger;
@@ -448,6 +449,10 @@ impl AccessStore for PostgresStore {
 
     async fn put_token(&self, token: &TokenRecord) -> Result<(), StoreError> {
         on!(self.0, pool, |conn| tenants::write_token(conn, token))
+    }
+
+    async fn forget_token(&self, id: &str) -> Result<(), StoreError> {
+        on!(self.0, pool, |conn| tenants::forget_token(conn, id))
     }
 
     async fn tokens(&self) -> Result<Vec<TokenRecord>, StoreError> {

@@ -180,9 +180,14 @@ fn pool_of_renewals(connect: PgConnectOptions, connections: u32) -> PgPool {
 
 /// Creates the tables or brings them to this version; two coordinators that start together take turns.
 async fn migrate(conn: &mut PgConnection) -> Result<(), StoreError> {
-    let sql = include_str!("migrations/0001.sql").into_sql_str();
-    let first = Migration::new(1, "tables".into(), MigrationType::Simple, sql, false);
-    let migrations = Migrator::with_migrations(vec![first]);
+    let all = [
+        (1, "tables", include_str!("migrations/0001.sql")),
+        (2, "histories", include_str!("migrations/0002.sql")),
+    ];
+    let migrations = all.map(|(version, name, sql)| {
+        Migration::new(version, name.into(), MigrationType::Simple, sql.into_sql_str(), false)
+    });
+    let migrations = Migrator::with_migrations(migrations.to_vec());
     migrations.run(conn).await.map_err(|error| match error {
         MigrateError::VersionMissing(found) => StoreError::OtherSchema { found, program: PROGRAM },
         MigrateError::VersionMismatch(version) => StoreError::Corrupt {

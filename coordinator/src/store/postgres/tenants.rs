@@ -103,6 +103,11 @@ pub async fn write_token(conn: &mut PgConnection, token: &TokenRecord) -> Result
     Ok(())
 }
 
+pub async fn forget_token(conn: &mut PgConnection, id: &str) -> Result<(), StoreError> {
+    let delete = sqlx::query("DELETE FROM tokens WHERE token_id = $1").bind(id);
+    delete.execute(conn).await.map(drop).map_err(unavailable)
+}
+
 pub async fn tokens(conn: &mut PgConnection) -> Result<Vec<TokenRecord>, StoreError> {
     let rows: Vec<Vec<u8>> = sqlx::query_scalar("SELECT row FROM tokens ORDER BY token_id")
         .fetch_all(conn)

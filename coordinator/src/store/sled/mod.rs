@@ -387,6 +387,11 @@ impl AccessStore for SledStore {
         self.flusher.sync().await
     }
 
+    async fn forget_token(&self, id: &str) -> Result<(), StoreError> {
+        self.put_alone::<TokenRecord>("tokens", &self.trees.tokens, id, None)?;
+        self.flusher.sync().await
+    }
+
     async fn tokens(&self) -> Result<Vec<TokenRecord>, StoreError> {
         let rows = self.trees.tokens.iter().map(|row| {
             let (_, bytes) = row.map_err(|e| self.storage_error(e))?;

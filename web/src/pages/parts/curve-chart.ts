@@ -1,0 +1,324 @@
+// One chart of the curves: uPlot, with zoom along x that all charts share, and keys for what the mouse does.
+
+import uPlot from 'uplot';
+
+import { h } from '../../viewer/dom.ts';
+import { colourReader } from './elements.ts';
+import { duration } from './format.ts';
+import { type Along, type Line, QUANTITIES, type Quantity, joined, placeText, valueAt } from './curve-points.ts';
+
+/** A series as the chart draws it. */
+export interface DrawnLine {
+    readonly task: string;
+    readonly label: string;
+    readonly line: Line;
+    readonly colour: string;
+    readonly dash: readonly number[];
+}
+
+export interface Zoom {
+    readonly min: number;
+    readonly max: number;
+}
+
+export interface ChartActions {
+    zoom(to: Zoom | null): void;
+    /** The cursor is at this place of x; null where it left. */
+    point(x: number | null): void;
+}
+
+const HEIGHT = 190;
+/** Steps between marks along time, seconds. */
+const TIME_STEPS = [
+    1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 10_800, 21_600, 43_200, 86_400, 172_800,
+];
+const FONT = '12px system-ui, sans-serif';
+
+/** Of the marks of a logarithm only 1, 2 and 5 times powers of ten; the rest would be a wall of lines. */
+const roundOnly = (_: uPlot, splits: number[]): (number | null)[] =>
+    splits.map((value) =>
+        [1, 2, 5].includes(Math.round(value / 10 ** Math.floor(Math.log10(value * (1 + 1e-9))))) ? value : null,
+    );
+
+export class Chart {
+    readonly element: HTMLElement;
+    readonly quantity: Quantity;
+    readonly #actions: ChartActions;
+    readonly #place = h('span', { class: 'fp-curve-place' });
+    readonly #stage: HTMLElement;
+    readonly #readout = h('ul', { class: 'fp-curve-readout' });
+    readonly #nothing = h('p', { class: 'fp-curve-nothing', hidden: true });
+    #plot: uPlot | null = null;
+    #lines: readonly DrawnLine[] = [];
+    #key = '';
+    #along: Along = 'iteration';
+    #whole: Zoom = { min: 0, max: 1 };
+    #zoom: Zoom | null = null;
+    #x: number | null = null;
+
+    constructor(quantity: Quantity, actions: ChartActions) {
+        this.quantity = quantity;
+        this.#actions = actions;
+        const { title } = QUANTITIES[quantity];
+        this.#stage = h('div', {
+            class: 'fp-curve-stage',
+            tabindex: 0,
+            role: 'application',
+            'aria-roledescription': 'chart',
+            'aria-label': `${title}. Arrow keys move the cursor, + and − zoom, 0 shows everything.`,
+            onkeydown: (event) => this.#press(event as KeyboardEvent),
+            onblur: () => this.#actions.point(null),
+        });
+        const head = h('header', { class: 'fp-curve-head' }, h('h3', {}, title), this.#place);
+        this.element = h('section', { class: 'fp-curve' }, head, this.#nothing, this.#stage, this.#readout);
+    }
+
+    /** Draws lines; the zoom stays unless another is given. */
+    draw(lines: readonly DrawnLine[], along: Along, whole: Zoom, zoom: Zoom | null): void {
+        this.#whole = whole;
+        this.#lines = lines;
+        this.#zoom = zoom;
+        const isEmpty = lines.every(({ line }) => line.xs.length === 0);
+        this.#nothing.hidden = !isEmpty;
+        this.#stage.hidden = isEmpty;
+        this.#readout.hidden = isEmpty;
+        this.#nothing.textContent = this.#whyNothing(lines.length);
+        if (isEmpty) {
+            this.#drop();
+            return;
+        }
+        const { xs, columns } = joined(lines.map(({ line }) => line));
+        const data = [xs, ...columns] as uPlot.AlignedData;
+        const key = `${along} ${lines.map(({ task, colour, dash }) => `${task} ${colour} ${dash.join('-')}`).join(', ')}`;
+        if (key !== this.#key || this.#plot === null) {
+            // Other lines or another axis: uPlot takes its options only once.
+            this.#drop();
+            this.#key = key;
+            this.#along = along;
+            this.#plot = new uPlot(this.#options(lines, along), data, this.#stage);
+        } else {
+            // The scales follow in `#applyZoom`.
+            this.#plot.setData(data, false);
+        }
+        this.#applyZoom();
+        this.showPlace(this.#x);
+    }
+
+    setZoom(zoom: Zoom | null): void {
+        this.#zoom = zoom;
+        this.#applyZoom();
+    }
+
+    /** Shows the values at a place of x, also where the cursor is in another chart. */
+    showPlace(x: number | null): void {
+        this.#x = x;
+        this.#place.textContent = x === null ? 'latest' : placeText(x, this.#along);
+        const { text } = QUANTITIES[this.quantity];
+        this.#readout.replaceChildren(
+            ...this.#lines.map(({ label, line, colour, dash }) => {
+                const value = x === null ? valueAt(line, Infinity) : valueAt(line, x);
+                const mark = h('span', { class: 'fp-swatch', 'aria-hidden': 'true' });
+                mark.style.borderTopColor = `var(${colour})`;
+                mark.style.borderTopStyle = dashStyle(dash);
+                return h('li', {}, mark, h('span', {}, `${label} `, h('b', {}, value === null ? '–' : text(value))));
+            }),
+        );
+        const plot = this.#plot;
+        if (plot !== null && x !== null && plot.cursor.idx !== plot.valToIdx(x)) {
+            plot.setCursor({ left: plot.valToPos(x, 'x'), top: -10 }, false);
+        } else if (plot !== null && x === null) {
+            plot.setCursor({ left: -10, top: -10 }, false);
+        }
+    }
+
+    resize(): void {
+        const width = this.#stage.clientWidth;
+        if (this.#plot !== null && width > 0 && width !== this.#plot.width) {
+            this.#plot.setSize({ width, height: HEIGHT });
+        }
+    }
+
+    /** Reads the colours again. */
+    recolour(): void {
+        this.#key = '';
+    }
+
+    destroy(): void {
+        this.#drop();
+        this.element.remove();
+    }
+
+    #whyNothing(drawn: number): string {
+        if (drawn === 0) {
+            return 'Choose a task above.';
+        }
+        const words: Partial<Record<Quantity, string>> = {
+            psnr: 'Not measured yet. Held-out photographs are measured during training where train.eval_every is set.',
+            memory: 'The drivers of these workers do not report their memory.',
+        };
+        return words[this.quantity] ?? 'No values yet.';
+    }
+
+    #drop(): void {
+        this.#plot?.destroy();
+        this.#plot = null;
+        this.#key = '';
+    }
+
+    #applyZoom(): void {
+        const plot = this.#plot;
+        if (plot === null) {
+            return;
+        }
+        plot.setScale('x', this.#zoom ?? this.#whole);
+    }
+
+    #options(lines: readonly DrawnLine[], along: Along): uPlot.Options {
+        const colour = colourReader(this.element);
+        const axis = { stroke: colour('--soft'), font: FONT, grid: { stroke: colour('--line'), width: 1 } };
+        const { isLog, text } = QUANTITIES[this.quantity];
+        const isTime = along === 'time';
+        const isMemory = this.quantity === 'memory';
+        return {
+            width: Math.max(200, this.#stage.clientWidth),
+            height: HEIGHT,
+            padding: [8, 24, 0, 0],
+            legend: { show: false },
+            scales: { x: { time: false }, y: isLog ? { distr: 3 } : {} },
+            series: [
+                {},
+                ...lines.map(({ label, colour: name, dash, line }): uPlot.Series => ({
+                    label,
+                    stroke: colour(name),
+                    width: 1.75,
+                    dash: [...dash],
+                    points: { show: this.quantity === 'psnr' || line.xs.length < 3, size: 5, fill: colour(name) },
+                })),
+            ],
+            axes: [
+                {
+                    ...axis,
+                    size: 28,
+                    ticks: { stroke: colour('--line'), size: 4 },
+                    ...(isTime ? { incrs: TIME_STEPS, space: 70 } : { space: 60 }),
+                    values: (_, splits) =>
+                        splits.map((x) => (isTime ? duration(1000 * x) : x.toLocaleString('en-GB'))),
+                },
+                {
+                    ...axis,
+                    size: 64,
+                    ticks: { show: false },
+                    ...(isLog ? { filter: roundOnly, grid: { ...axis.grid, filter: roundOnly } } : {}),
+                    values: (_, splits) =>
+                        splits.map((y: number | null) => (y === null ? '' : this.#axisText(y, text))),
+                    ...(isMemory
+                        ? {
+                              incrs: [1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024, 2048, 4096, 8192, 16_384].map(
+                                  (m) => m * 2 ** 20,
+                              ),
+                          }
+                        : {}),
+                },
+            ],
+            cursor: {
+                y: false,
+                drag: { x: true, y: false, setScale: false },
+                points: { size: 7 },
+                bind: {
+                    dblclick: () => () => {
+                        this.#actions.zoom(null);
+                        return null;
+                    },
+                },
+            },
+            hooks: {
+                setSelect: [
+                    (plot) => {
+                        if (plot.select.width > 4) {
+                            const { left, width } = plot.select;
+                            this.#actions.zoom({
+                                min: plot.posToVal(left, 'x'),
+                                max: plot.posToVal(left + width, 'x'),
+                            });
+                            plot.setSelect({ left: 0, top: 0, width: 0, height: 0 }, false);
+                        }
+                    },
+                ],
+                setCursor: [
+                    (plot) => {
+                        const { idx, left } = plot.cursor;
+                        const x =
+                            idx === null || idx === undefined || (left ?? -1) < 0
+                                ? null
+                                : (plot.data[0][idx] ?? null);
+                        if (x !== this.#x) {
+                            this.#actions.point(x);
+                        }
+                    },
+                ],
+            },
+        };
+    }
+
+    #axisText(value: number, text: (value: number) => string): string {
+        if (this.quantity === 'psnr') {
+            return String(Number(value.toFixed(2)));
+        }
+        if (this.quantity === 'gaussians' && value >= 1e6) {
+            return `${Number((value / 1e6).toFixed(2))} M`;
+        }
+        if (this.quantity === 'loss') {
+            return String(Number(value.toPrecision(2)));
+        }
+        if (this.quantity === 'memory') {
+            // Marks lie at whole MiB, so that the digits after the point are zeros.
+            return text(value).replace(/\.0+ |(\.\d*[1-9])0+ /, '$1 ');
+        }
+        return this.quantity === 'rate' ? String(Number(value.toPrecision(3))) : text(value);
+    }
+
+    #press(event: KeyboardEvent): void {
+        const plot = this.#plot;
+        if (plot === null || event.ctrlKey || event.metaKey || event.altKey) {
+            return;
+        }
+        const xs = plot.data[0];
+        const { min = 0, max = 1 } = plot.scales['x'] as { min?: number; max?: number };
+        const at = this.#x === null ? plot.valToIdx(max) : plot.valToIdx(this.#x);
+        const moves: Record<string, number> = {
+            ArrowLeft: -1,
+            ArrowRight: 1,
+            PageUp: -10,
+            PageDown: 10,
+            Home: -Infinity,
+            End: Infinity,
+        };
+        const by = moves[event.key];
+        const middle = this.#x ?? (min + max) / 2;
+        const zoom = (factor: number): void => {
+            const [left, right] = [middle - (middle - min) * factor, middle + (max - middle) * factor];
+            const [from, to] = [Math.max(left, this.#whole.min), Math.min(right, this.#whole.max)];
+            this.#actions.zoom(from === this.#whole.min && to === this.#whole.max ? null : { min: from, max: to });
+        };
+        if (by !== undefined) {
+            const to = Math.min(
+                xs.length - 1,
+                Math.max(0, this.#x === null && by < 0 && by > -Infinity ? at : at + by),
+            );
+            this.#actions.point(xs[to] ?? null);
+        } else if (event.key === '+' || event.key === '=') {
+            zoom(0.6);
+        } else if (event.key === '-') {
+            zoom(1 / 0.6);
+        } else if (event.key === '0' || event.key === 'Escape') {
+            this.#actions.zoom(null);
+        } else {
+            return;
+        }
+        event.preventDefault();
+    }
+}
+
+/** The line style of a swatch, for dashes of a line. */
+export const dashStyle = (dash: readonly number[]): string =>
+    dash.length === 0 ? 'solid' : (dash[0] ?? 0) > 3 ? 'dashed' : 'dotted';

@@ -1,0 +1,192 @@
+// From the history of tasks to the columns that a chart draws.
+
+import { brief, duration, grouped, memory } from './format.ts';
+
+/** A point of the curves of a task. */
+export interface CurvePoint {
+    readonly timeMs: number;
+    readonly attempt: number;
+    readonly iteration: number;
+    readonly loss: number;
+    /** On held-out views, dB; null before the first measurement. */
+    readonly psnr: number | null;
+    readonly gaussians: number;
+    /** Iterations per second. */
+    readonly rate: number;
+    /** GPU memory; 0 where the driver does not report it. */
+    readonly memoryBytes: number;
+}
+
+/** The curves of one task. */
+export interface CurveSeries {
+    readonly task: string;
+    /** What readers call it: "Partition 3". */
+    readonly label: string;
+    /** In the order in which they were reported. */
+    readonly points: readonly CurvePoint[];
+}
+
+export interface CurvesData {
+    readonly series: readonly CurveSeries[];
+}
+
+export type Quantity = 'loss' | 'psnr' | 'gaussians' | 'rate' | 'memory';
+export type Along = 'iteration' | 'time';
+
+export interface QuantityWords {
+    readonly title: string;
+    readonly isLog: boolean;
+    text(value: number): string;
+}
+
+export const QUANTITIES: Readonly<Record<Quantity, QuantityWords>> = {
+    loss: { title: 'Loss, logarithmic', isLog: true, text: (value) => brief(value) },
+    psnr: { title: 'PSNR on held-out photographs, dB', isLog: false, text: (value) => value.toFixed(2) },
+    gaussians: { title: 'Gaussians', isLog: false, text: grouped },
+    rate: { title: 'Iterations per second', isLog: false, text: (value) => brief(value) },
+    memory: { title: 'GPU memory', isLog: false, text: memory },
+};
+
+/** The value of a point; null where it is not known, and where a logarithm does not exist. */
+export function valueOf(point: CurvePoint, quantity: Quantity): number | null {
+    const values: Record<Quantity, number | null> = {
+        loss: point.loss > 0 ? point.loss : null,
+        psnr: point.psnr,
+        gaussians: point.gaussians,
+        rate: point.rate > 0 ? point.rate : null,
+        memory: point.memoryBytes > 0 ? point.memoryBytes : null,
+    };
+    const value = values[quantity];
+    return value !== null && Number.isFinite(value) ? value : null;
+}
+
+/** The points that still hold: an attempt that resumed earlier replaces those after its beginning. */
+export function currentPoints(points: readonly CurvePoint[]): CurvePoint[] {
+    const kept: CurvePoint[] = [];
+    for (const point of points) {
+        while (kept.length > 0 && kept.at(-1)!.iteration >= point.iteration) {
+            kept.pop();
+        }
+        kept.push(point);
+    }
+    return kept;
+}
+
+/** One line of a chart: places along x, and values, where null is a gap. */
+export interface Line {
+    readonly xs: number[];
+    readonly ys: (number | null)[];
+}
+
+/**
+ * The line of a task. Along time, which is counted in seconds from `startMs`, there is a gap between attempts.
+ * Of a PSNR, which is reported until the next measurement, only the changes are kept.
+ */
+export function lineOf(points: readonly CurvePoint[], quantity: Quantity, along: Along, startMs: number): Line {
+    const line: Line = { xs: [], ys: [] };
+    let before: CurvePoint | null = null;
+    let last: number | null = null;
+    for (const point of points) {
+        const value = valueOf(point, quantity);
+        if (value === null || (quantity === 'psnr' && value === last)) {
+            continue;
+        }
+        const x = along === 'iteration' ? point.iteration : (point.timeMs - startMs) / 1000;
+        const lastX = line.xs.at(-1);
+        if (
+            along === 'time' &&
+            before !== null &&
+            before.attempt !== point.attempt &&
+            lastX !== undefined &&
+            x > lastX
+        ) {
+            line.xs.push((x + lastX) / 2);
+            line.ys.push(null);
+        }
+        // A clock that went back must not draw a line back.
+        if (lastX === undefined || x > lastX) {
+            line.xs.push(x);
+            line.ys.push(value);
+        }
+        [before, last] = [point, value];
+    }
+    return line;
+}
+
+/** Lines over common places: `undefined` where a line has no point, which is no gap. */
+export function joined(lines: readonly Line[]): { xs: number[]; columns: (number | null | undefined)[][] } {
+    const xs = [...new Set(lines.flatMap((line) => line.xs))].toSorted((a, b) => a - b);
+    const places = new Map(xs.map((x, i) => [x, i]));
+    const columns = lines.map((line) => {
+        const column = Array.from<number | null | undefined>({ length: xs.length });
+        line.xs.forEach((x, i) => (column[places.get(x)!] = line.ys[i]!));
+        return column;
+    });
+    return { xs, columns };
+}
+
+/** The value of a line at a place: its latest point there or before, null before its first. */
+export function valueAt(line: Line, x: number): number | null {
+    const last = line.xs.findLastIndex((other, i) => other <= x && line.ys[i] !== null);
+    return last < 0 ? null : line.ys[last]!;
+}
+
+/** When the first point of all was reported. */
+export const startOf = (series: readonly CurveSeries[]): number =>
+    series.reduce((first, { points }) => Math.min(first, points[0]?.timeMs ?? Infinity), Infinity);
+
+/** The part of x that has points; never without length. */
+export function spanOf(series: readonly CurveSeries[], along: Along, startMs: number): { min: number; max: number } {
+    const place = (point: CurvePoint): number =>
+        along === 'iteration' ? point.iteration : (point.timeMs - startMs) / 1000;
+    const ends = series.flatMap(({ points }) =>
+        points.length === 0 ? [] : [place(points[0]!), place(points.at(-1)!)],
+    );
+    const [min, max] = ends.length === 0 ? [0, 1] : [Math.min(...ends), Math.max(...ends)];
+    return max > min ? { min, max } : { min: min - 1, max: max + 1 };
+}
+
+/** Most series that are drawn without being asked for. */
+export const MOST_DRAWN = 12;
+
+/** The tasks to draw at first: those that reported last, since they are the ones that run. */
+export function firstDrawn(series: readonly CurveSeries[]): string[] {
+    const order = series
+        .map(({ task, points }, i) => ({ task, i, last: points.at(-1)?.timeMs ?? -Infinity }))
+        .filter(({ last }) => last > -Infinity)
+        .toSorted((a, b) => b.last - a.last || a.i - b.i)
+        .slice(0, MOST_DRAWN)
+        .toSorted((a, b) => a.i - b.i);
+    return order.map(({ task }) => task);
+}
+
+/** What the x axis says of a place. */
+export const placeText = (x: number, along: Along): string =>
+    along === 'iteration' ? `iteration ${grouped(x)}` : `after ${duration(1000 * x)}`;
+
+/** The colour and the dashes of each drawn series; what it has it keeps while it is drawn. */
+export class Looks {
+    readonly #taken = new Map<string, number>();
+
+    /** Frees the looks of all others. */
+    keep(tasks: ReadonlySet<string>): void {
+        [...this.#taken.keys()].filter((task) => !tasks.has(task)).forEach((task) => this.#taken.delete(task));
+        for (const task of tasks) {
+            if (!this.#taken.has(task)) {
+                const taken = new Set(this.#taken.values());
+                let free = 0;
+                while (taken.has(free)) {
+                    free += 1;
+                }
+                this.#taken.set(task, free);
+            }
+        }
+    }
+
+    /** A CSS variable, and dashes in pixels; eight colours solid, then dashed, then dotted. */
+    of(task: string): { readonly colour: string; readonly dash: readonly number[] } {
+        const number = this.#taken.get(task) ?? 0;
+        const dashes = [[], [7, 4], [2, 3]];
+        return { colour: `--curve-${(number % 8) + 1}`, dash: dashes[Math.floor(number / 8) % 3]! };
+    }
+}

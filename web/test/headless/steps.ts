@@ -1,0 +1,68 @@
+// What tests with pages of a service do again and again.
+
+import assert from 'node:assert/strict';
+import { readFileSync } from 'node:fs';
+import { createRequire } from 'node:module';
+import type { Browser, BrowserContextOptions, Page } from 'playwright-core';
+
+import { newPage } from './browser.ts';
+
+const AXE = readFileSync(createRequire(import.meta.url).resolve('axe-core/axe.min.js'), 'utf8');
+
+export interface Opened {
+    readonly page: Page;
+    /** What the console and the policy complain about. */
+    readonly complaints: string[];
+}
+
+export const sleep = (ms: number): Promise<void> => new Promise((done) => setTimeout(done, ms));
+
+export async function until(what: string, isSo: () => Promise<boolean>, seconds = 60): Promise<void> {
+    const end = Date.now() + seconds * 1000;
+    while (!(await isSo())) {
+        assert.ok(Date.now() < end, `${what} within ${seconds} s`);
+        await sleep(150);
+    }
+}
+
+/** Opens a page as its user would find it: signed in, with the token in the session of the tab. */
+export async function openAs(browser: Browser, address: string, token = '', options: BrowserContextOptions = {}): Promise<Opened> {
+    const opened = await newPage(browser, { viewport: { width: 1200, height: 850 }, ...options });
+    if (token !== '') {
+        await opened.page.addInitScript((value) => {
+            // Only once: after a sign-out it must not come back.
+            if (sessionStorage.getItem('test.set') === null) {
+                sessionStorage.setItem('test.set', 'yes');
+                sessionStorage.setItem('fathom.token', value);
+            }
+        }, token);
+    }
+    await opened.page.goto(address);
+    return opened;
+}
+
+/** No violation that axe can find. */
+export async function accessible(page: Page, what: string): Promise<void> {
+    // Through the debugger: the policy of the page lets no script in.
+    await page.evaluate(AXE);
+    const found = await page.evaluate(async () => {
+        const { axe } = window as unknown as {
+            axe: { run(): Promise<{ violations: { id: string; help: string; nodes: { html: string }[] }[] }> };
+        };
+        const { violations } = await axe.run();
+        return violations.map(({ id, help, nodes }) => `${id}: ${help}: ${nodes.map(({ html }) => html.slice(0, 200)).join(' | ')}`);
+    });
+    assert.deepEqual(found, [], what);
+}
+
+/** Nothing is wider than the window. */
+export async function fitsWindow(page: Page, what: string): Promise<void> {
+    const [wide, shown] = await page.evaluate(() => [document.documentElement.scrollWidth, document.documentElement.clientWidth]);
+    assert.ok(wide! <= shown!, `${what}: ${wide} of ${shown} pixels`);
+}
+
+export async function finish({ page, complaints }: Opened, allowed: RegExp | null = null): Promise<void> {
+    const wrong = complaints.filter((text) => allowed === null || !allowed.test(text));
+    assert.deepEqual(wrong, [], 'the console and the policy have nothing to say');
+    await page.context().close();
+}
