@@ -60,21 +60,18 @@ export class Service {
     readonly folder: string;
     readonly grpcPort: number;
     readonly webPort: number;
-    readonly #flags: readonly string[];
     #coordinator: ChildProcess | null = null;
     readonly #workers: ChildProcess[] = [];
 
-    private constructor(fathom: string, folder: string, grpcPort: number, webPort: number, flags: readonly string[]) {
+    private constructor(fathom: string, folder: string, grpcPort: number, webPort: number) {
         this.fathom = fathom;
         this.folder = folder;
         this.grpcPort = grpcPort;
         this.webPort = webPort;
-        this.#flags = flags;
     }
 
-    /** `flags` are further ones of the coordinator. */
-    static async start(fathom: string, folder: string, ...flags: readonly string[]): Promise<Service> {
-        const service = new Service(fathom, folder, await freePort(), await freePort(), flags);
+    static async start(fathom: string, folder: string): Promise<Service> {
+        const service = new Service(fathom, folder, await freePort(), await freePort());
         await service.startCoordinator();
         return service;
     }
@@ -91,7 +88,7 @@ export class Service {
     async startCoordinator(): Promise<void> {
         const [grpc, web] = [`127.0.0.1:${this.grpcPort}`, `127.0.0.1:${this.webPort}`];
         const data = join(this.folder, 'data');
-        const flags = ['--data-dir', data, '--listen', grpc, '--web', web, '--tokens', ...this.#flags];
+        const flags = ['--data-dir', data, '--listen', grpc, '--web', web, '--tokens'];
         this.#coordinator = spawn(this.fathom, ['coordinator', ...flags], { stdio: 'ignore' });
         const until = Date.now() + START_MS;
         // Any answer will do; without a token it is a refusal.

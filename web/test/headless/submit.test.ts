@@ -52,8 +52,7 @@ before(async () => {
     }
     folder = mkdtempSync(join(tmpdir(), 'fathom-submit-'));
     data = join(folder, 'reef');
-    // Workers send previews when they renew their leases.
-    service = await Service.start(FATHOM, folder, '--lease-ms', '12000');
+    service = await Service.start(FATHOM, folder);
     execFileSync(FATHOM, ['synth', data, '--views', '20', '--size', '96x72'], { stdio: 'ignore' });
     tokens.ana = service.token('ana', '--role', 'submitter', '--tenant', 'reef');
     tokens.vera = service.token('vera', '--role', 'viewer', '--tenant', 'reef');
