@@ -20,7 +20,7 @@ use crate::state::{State, stopped};
 use crate::store::StoreError;
 
 /// Points of a stored curve at most.
-pub const MOST_POINTS: usize = 240;
+const MOST_POINTS: usize = 240;
 /// Previews of a task at most.
 const MOST_PREVIEWS: usize = 96;
 /// Previews of a message that are read.
@@ -67,10 +67,9 @@ impl News {
     fn extend(&mut self, later: Self) {
         self.points.extend(later.points);
         self.previews.extend(later.previews);
-        // The store does not answer.
-        let latest = |length: usize, most: usize| length.saturating_sub(most)..;
-        self.points = self.points.split_off(latest(self.points.len(), MOST_WAITING).start);
-        self.previews = self.previews.split_off(latest(self.previews.len(), MOST_PREVIEWS).start);
+        // The store does not answer: the latest are kept.
+        self.points.drain(..self.points.len().saturating_sub(MOST_WAITING));
+        self.previews.drain(..self.previews.len().saturating_sub(MOST_PREVIEWS));
     }
 }
 
