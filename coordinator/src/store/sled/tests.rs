@@ -190,7 +190,16 @@ async fn the_snapshot_that_an_open_store_is_writing_is_left_alone() {
 
 /// Writes a raw row of `meta`, bypassing the store.
 fn put_in_meta(options: &SledOptions, key: &str, bytes: &[u8]) {
-    let db = sled::open(options.dir.join("sled")).unwrap();
+    let begin = std::time::Instant::now();
+    let db = loop {
+        // sled's threads release the lock a moment after the last handle is dropped.
+        match sled::open(options.dir.join("sled")) {
+            Err(sled::Error::Io(_)) if begin.elapsed().as_secs() < 10 => {
+                std::thread::sleep(std::time::Duration::from_millis(20));
+            }
+            opened => break opened.unwrap(),
+        }
+    };
     db.open_tree("meta").unwrap().insert(key, bytes).unwrap();
     db.flush().unwrap();
 }
@@ -214,13 +223,10 @@ async fn a_store_of_another_layout_is_refused_with_both_versions() {
     ] {
         // This program ignores fields that a later program may add.
         let text = format!(r#"{{"layout":{layout},"program":"9.8.7","cipher":"none"}}"#);
-        // The lock is released a moment after the last handle is dropped.
-        std::thread::sleep(std::time::Duration::from_millis(200));
         put_in_meta(&options, "written_by", text.as_bytes());
         let Err(error) = open_again(&options) else { panic!("layout {layout} was opened") };
         let said = error.to_string();
         assert!(said.contains(&expected.replace("VERSION", PROGRAM)), "{said}");
-        std::thread::sleep(std::time::Duration::from_millis(200));
         put_in_meta(&options, "written_by", br#"{"layout":2,"program":"0.0.1"}"#);
     }
 }
@@ -276,7 +282,11 @@ async fn read_only_access_opens_a_copy_and_changes_no_byte() {
     let (_, rows) = store_with_a_snapshot(&options).await;
     // As a full disk leaves it.
     std::fs::write(dir.path().join("sled/snap.7FFFFFFFFFFFFFFF.generating"), "").unwrap();
-    std::thread::sleep(std::time::Duration::from_millis(200));
+    // sled's threads have released the directory once it can be copied.
+    while let Err(error) = SledStore::open_copy(&options, Some(scratch.path())) {
+        assert!(matches!(error, StoreError::InUse { .. }), "{error}");
+        std::thread::sleep(std::time::Duration::from_millis(20));
+    }
     let before = files_under(dir.path());
     let copy = SledStore::open_copy(&options, Some(scratch.path())).unwrap();
     assert!(copy.export().await.unwrap() == rows);
