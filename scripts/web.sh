@@ -4,8 +4,9 @@
 #     scripts/web.sh build      web/dist from web/src
 #     scripts/web.sh check      types, lints, unit tests; that the protos give the committed web/src/rpc, and
 #                               the sources the committed web/dist
-#     scripts/web.sh headless   the built pages in Chromium beside `fathom render` (quick: two small models),
-#                               and before a coordinator and a worker
+#     scripts/web.sh headless   the built pages in Chromium beside `fathom render`, before a coordinator and a
+#                               worker, and for an hour of news (quick: two small models, without the hour)
+#     scripts/web.sh pictures   docs/using/*.jpg of the pages, from a service with a small job; look at them
 #
 # Needs npm and its registry. The packages, with Node as the package `node`, are those of
 # web/package-lock.json; Chromium is that of the system. Exits with 3 where npm or Chromium is missing, so
@@ -36,6 +37,15 @@ packages() {
     fi
     # Node of the lock file before that of the system.
     PATH=$PWD/node_modules/.bin:$PATH
+}
+
+# The first that there is; the tests take the same.
+find_browser() {
+    [ -n "${CHROMIUM:-}" ] || CHROMIUM=$(command -v chromium-headless-shell chromium google-chrome | head -n 1) ||
+        true
+    export CHROMIUM
+    [ -n "$CHROMIUM" ] ||
+        not_checked "there is no Chromium, so the pages were not opened; run scripts/setup.sh --for-tests"
 }
 
 # Builds into a folder of its own. web/dist stays as it is: with another time of its files, cargo would build
@@ -84,22 +94,23 @@ case "${1:-}" in
         ;;
     headless)
         packages
-        # The first that there is; the tests take the same.
-        [ -n "${CHROMIUM:-}" ] || CHROMIUM=$(command -v chromium-headless-shell chromium google-chrome | head -n 1) ||
-            true
-        export CHROMIUM
-        [ -n "$CHROMIUM" ] ||
-            not_checked "there is no Chromium, so the pages were not opened; run scripts/setup.sh --for-tests"
+        find_browser
         data=$(mktemp -d)
         trap 'rm -rf "$data"' EXIT
         scripts/make-test-data.sh "$fathom" "$data" ${2:+"$2"} >"$data/log" 2>&1 || {
             tail -n 20 "$data/log" >&2
             exit 1
         }
+        [ "${2:-}" != quick ] || export HEADLESS_QUICK=1
         FATHOM=$fathom VIEWER_DATA=$data npm run --silent headless
         ;;
+    pictures)
+        packages
+        find_browser
+        FATHOM=$fathom node test/headless/take-pictures.ts ../docs/using
+        ;;
     *)
-        sed -n '2,15p' "$self" | sed 's/^# \{0,1\}//'
+        sed -n '2,16p' "$self" | sed 's/^# \{0,1\}//'
         exit 2
         ;;
 esac

@@ -234,6 +234,7 @@ fn blob(name: &str) -> BlobRef {
 /// A job at its partitions.
 async fn plan(store: &dyn Store, partitions: usize) -> Result<(), Failure> {
     let new = NewJob {
+        announce: false,
         job_id: JobId::new(NOW_MS, 0),
         tenant: Tenant::default(),
         request_id: "request".into(),

@@ -96,6 +96,7 @@ fn blob(name: &str) -> BlobRef {
 
 fn new_job(number: u32) -> NewJob {
     NewJob {
+        announce: false,
         job_id: JobId::new(NOW_MS, number),
         tenant: Tenant::default(),
         request_id: format!("request {number}"),

@@ -43,6 +43,11 @@ pub struct CoordinatorConfig {
     /// file.
     #[serde(skip)]
     pub own_page: bool,
+    /// URL for a signed POST request at the end of each job that is created from then on. Default none.
+    pub webhook: Option<String>,
+    /// File with the secret of `webhook`: `whsec_` and 24 to 64 bytes in base64, as Standard Webhooks has it.
+    /// Default none: `webhook.secret` in `data_dir`, made where it is missing.
+    pub webhook_secret: Option<PathBuf>,
     /// Where to serve KEDA, which starts workers by the number of tasks; port 0 takes a free one. Beyond this
     /// machine it needs `tls_cert`, `tls_key` and `scaler_client_ca`. Default: nowhere.
     pub scaler_listen: Option<SocketAddr>,
@@ -120,6 +125,8 @@ impl Default for CoordinatorConfig {
             metrics_listen: None,
             web: None,
             own_page: false,
+            webhook: None,
+            webhook_secret: None,
             scaler_listen: None,
             scaler_client_ca: None,
             lease_ms: 60_000,
@@ -182,6 +189,12 @@ impl CoordinatorConfig {
                 || self.scaler_listen.is_none_or(|listen| listen.ip().is_loopback()),
             "scaler_listen is reachable from other machines, and anyone could read how many tasks there are: set tls_cert, \
              tls_key and scaler_client_ca, or insecure = true",
+        );
+        let webhook = self.webhook.as_deref().map(|url| crate::webhook::check(url, self.insecure));
+        require(!matches!(webhook, Some(Err(_))), webhook.and_then(Result::err).unwrap_or_default());
+        require(
+            self.webhook_secret.is_none() || self.webhook.is_some(),
+            "webhook_secret needs webhook, the address that hears of the ends of jobs",
         );
         require(
             self.store_connections >= 2,

@@ -26,7 +26,7 @@ const MOST_PREVIEWS: usize = 96;
 /// Previews of a message that are read.
 const MOST_PREVIEWS_IN_MESSAGE: usize = 8;
 /// Points and previews of an answer about all tasks at most, and points of each of its tasks at least.
-const MOST_IN_ANSWER: usize = 24_000;
+const MOST_IN_ANSWER: usize = 12_000;
 const MOST_PREVIEWS_IN_ANSWER: usize = 2000;
 const LEAST_OF_TASK: usize = 12;
 /// Longest name of a view that is kept, bytes.
@@ -140,8 +140,22 @@ fn is_sound(preview: &v1::Preview) -> bool {
 /// Whether all numbers of a report can be drawn.
 fn is_readable(progress: &v1::Progress) -> bool {
     let held_out = progress.held_out.as_ref();
+    let of_rgb = |of: &v1::Rgb| [of.red, of.green, of.blue];
+    let water = progress.water.iter().flat_map(|water| [water.beta_d, water.beta_b, water.b_inf]);
+    let spent = progress.time_spent.iter().flat_map(|spent| {
+        [
+            spent.seconds,
+            spent.fetching_seconds,
+            spent.training_seconds,
+            spent.photographs_seconds,
+            spent.watching_seconds,
+            spent.sending_seconds,
+        ]
+    });
     progress.iterations_per_second.is_finite()
         && progress.loss.is_finite()
+        && water.flatten().all(|of| of_rgb(&of).iter().all(|value| value.is_finite()))
+        && spent.into_iter().all(f32::is_finite)
         && held_out.is_none_or(|held_out| held_out.psnr_db.is_finite() && held_out.ssim.is_finite())
 }
 
@@ -264,7 +278,12 @@ fn iteration(point: &v1::HistoryPoint) -> u32 {
 /// Adds a point behind a curve, and thins the curve when it has become too long.
 fn add(curve: &mut Vec<v1::HistoryPoint>, point: v1::HistoryPoint) {
     let seconds = |point: &v1::HistoryPoint| point.time.map_or(0, |time| time.seconds);
-    if let Some(last) = curve.last() {
+    if let Some(last) = curve.last_mut() {
+        if iteration(&point) == iteration(last) && point.attempt == last.attempt {
+            // It knows more: a measurement of this iteration, or the time until its result was stored.
+            *last = point;
+            return;
+        }
         let is_behind = iteration(&point) > iteration(last);
         let still_runs = seconds(&point) - seconds(last) < RUNS_WITHIN_SECONDS;
         if !is_behind && (point.attempt <= last.attempt || still_runs) {

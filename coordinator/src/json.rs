@@ -7,7 +7,7 @@ use fathom_proto::admin::v1::{Caller, Role, Tenant, Worker, WorkerState};
 use fathom_proto::v1::job_event::Event;
 use fathom_proto::v1::{
     Dataset, DatasetState, HeldOutMetrics, HistoryPoint, Job, JobEvent, JobState, LogEntry, LogSeverity,
-    Preview, Stage, Task, TaskHistory, TaskState,
+    Preview, Rgb, Stage, Task, TaskHistory, TaskState, TimeSpent, WaterNow,
 };
 use prost_types::Timestamp;
 use serde_json::{Value, json};
@@ -94,6 +94,7 @@ fn task(of: &Task) -> Value {
         "loss": measured.map(|p| p.loss),
         "iterations_per_second": measured.map(|p| p.iterations_per_second),
         "memory_bytes": (of.memory_bytes > 0).then_some(of.memory_bytes),
+        "model": of.model.as_ref().map(|blob| &blob.digest),
         "resumed_from_iteration": of.resumed_from_iteration,
         "checkpoint_iteration": of.checkpoint_iteration,
         "last_errors": of.last_errors,
@@ -161,6 +162,8 @@ pub fn task_history(of: &TaskHistory) -> Value {
             "iterations_per_second": progress.iterations_per_second,
             "memory_bytes": (progress.memory_bytes > 0).then_some(progress.memory_bytes),
             "held_out": progress.held_out.as_ref().map(held_out),
+            "water": progress.water.as_ref().map(water),
+            "time_spent": progress.time_spent.as_ref().map(time_spent),
         })
     };
     let preview = |of: &Preview| {
@@ -175,6 +178,22 @@ pub fn task_history(of: &TaskHistory) -> Value {
         "task": of.task_id,
         "points": of.points.iter().map(point).collect::<Vec<_>>(),
         "previews": of.previews.iter().map(preview).collect::<Vec<_>>(),
+    })
+}
+
+fn water(of: &WaterNow) -> Value {
+    let rgb = |of: &Option<Rgb>| of.as_ref().map(|of| json!([of.red, of.green, of.blue]));
+    json!({ "beta_d": rgb(&of.beta_d), "beta_b": rgb(&of.beta_b), "b_inf": rgb(&of.b_inf) })
+}
+
+fn time_spent(of: &TimeSpent) -> Value {
+    json!({
+        "seconds": of.seconds,
+        "fetching_seconds": of.fetching_seconds,
+        "training_seconds": of.training_seconds,
+        "photographs_seconds": of.photographs_seconds,
+        "watching_seconds": of.watching_seconds,
+        "sending_seconds": of.sending_seconds,
     })
 }
 

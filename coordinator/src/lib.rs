@@ -37,6 +37,7 @@ mod sweep;
 mod tls;
 mod wakeups;
 mod web;
+mod webhook;
 mod worker_registry;
 
 pub use clock::Clock;

@@ -49,6 +49,7 @@ use crate::sweep::sweep_leases;
 use crate::tls::Tls;
 use crate::wakeups::Wakeups;
 use crate::web;
+use crate::webhook::Webhook;
 use crate::worker_registry::WorkerRegistry;
 
 /// A half-open connection is detected after the sum of these; without keep-alives its streams would hang for
@@ -329,6 +330,7 @@ where
             }
         });
     }
+    let webhook = Webhook::of(&config)?;
     let metrics = Arc::new(Metrics::default());
     let shared = Arc::new(State {
         logs: crate::logs::of(store.as_ref(), &config.data_dir, config.attempt_log_bytes),
@@ -349,12 +351,16 @@ where
         gaps: Mutex::new(HashMap::new()),
         revoking: Default::default(),
         backing_up: Default::default(),
+        has_webhook: webhook.is_some(),
         capacity_timeout_ms: config.capacity_timeout_ms,
         policy: house.policy,
     });
     tracing::info!(%address, data_dir = %config.data_dir.display(), lease_ms = config.lease_ms, "coordinator serves");
     let lines = (Arc::clone(&shared.own_lines), Arc::clone(&shared.logs));
     tokio::spawn(logs::keep_own_lines(lines.0, lines.1, shared.stopping.clone()));
+    if let Some(webhook) = webhook {
+        tokio::spawn(webhook.run(Arc::clone(&shared)));
+    }
     if let Some((listener, address)) = for_metrics {
         tracing::info!(%address, "serving metrics and health");
         let served = http::serve(listener, Arc::new(Endpoint(Arc::downgrade(&shared))));

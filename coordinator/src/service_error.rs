@@ -43,6 +43,12 @@ pub enum ServiceError {
         /// Its digest.
         digest: String,
     },
+    /// A dataset that no job can train on.
+    #[error("{0}")]
+    BadScene(String),
+    /// Scenes in other datasets are being read.
+    #[error("the coordinator is reading the scenes of other datasets; try again in a minute")]
+    ReadsOtherScenes,
     /// A worker that did not register with this process.
     #[error("this worker is not registered; register again with the leases that it holds")]
     UnknownWorker,
@@ -250,12 +256,14 @@ impl From<ServiceError> for Status {
             ServiceError::BlobMissing { .. } | ServiceError::FilesMissing { .. } => {
                 (Code::FailedPrecondition, "BLOB_NOT_FOUND")
             }
+            ServiceError::BadScene(_) => (Code::FailedPrecondition, "BAD_SCENE"),
             ServiceError::Token(Refused::Missing) => (Code::Unauthenticated, "TOKEN_MISSING"),
             ServiceError::Token(Refused::NotValid) => (Code::Unauthenticated, "TOKEN_REFUSED"),
             ServiceError::RoleRefused { .. } | ServiceError::OfLink => {
                 (Code::PermissionDenied, "ROLE_REFUSED")
             }
             ServiceError::NoCertificate => (Code::Unauthenticated, "CERTIFICATE_MISSING"),
+            ServiceError::ReadsOtherScenes => (Code::ResourceExhausted, "RATE_LIMITED"),
             ServiceError::TooManyCalls(_) => (Code::ResourceExhausted, "RATE_LIMITED"),
             ServiceError::NoSuchToken(_) => (Code::NotFound, "TOKEN_NOT_FOUND"),
             ServiceError::LastOperator(_) => (Code::FailedPrecondition, "LAST_OPERATOR"),

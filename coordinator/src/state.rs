@@ -62,6 +62,8 @@ pub struct State {
     pub backing_up: tokio::sync::Mutex<()>,
     /// Retention times.
     pub policy: Policy,
+    /// Whether the ends of new jobs are announced ([`crate::webhook`]).
+    pub has_webhook: bool,
     /// See [`crate::CoordinatorConfig::capacity_timeout_ms`].
     pub capacity_timeout_ms: u32,
 }

@@ -4,6 +4,7 @@
 //! reports progress, keeps checkpoints and takes the result; it depends on nothing else.
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use crate::Result;
 use crate::gaussians::Gaussians;
@@ -11,7 +12,7 @@ use crate::gpu::Gpu;
 use crate::scene::{PinholeCamera, Pose};
 use crate::train::{HeldOutMetrics, Preview, Progress, TrainRun, Trainer};
 use crate::views::ViewSource;
-use crate::water::WaterRecord;
+use crate::water::{Water, WaterRecord};
 
 pub use crate::config::Method;
 
@@ -71,6 +72,15 @@ pub trait Run {
         go_on: &dyn Fn() -> bool,
     ) -> Result<Vec<Preview>>;
 
+    /// The water as it is now; `None` if the run has none.
+    ///
+    /// # Errors
+    /// When the device fails.
+    fn water(&self) -> Result<Option<Water>>;
+
+    /// How long the run has waited for photographs that were not read yet.
+    fn waited_for_photographs(&self) -> Duration;
+
     /// What the run has trained so far; a `metres_per_unit` of 0 means unknown.
     ///
     /// # Errors
@@ -119,6 +129,14 @@ impl Run for Trainer {
         go_on: &dyn Fn() -> bool,
     ) -> Result<Vec<Preview>> {
         self.preview(cameras, go_on)
+    }
+
+    fn water(&self) -> Result<Option<Water>> {
+        self.water()
+    }
+
+    fn waited_for_photographs(&self) -> Duration {
+        self.waited_for_photographs()
     }
 
     fn hand_in(&mut self, metres_per_unit: f64) -> Result<Trained> {

@@ -12,6 +12,7 @@ mod callers;
 mod datasets;
 mod history;
 mod hostile;
+mod inspection;
 mod jobs;
 mod leaving;
 mod links;
@@ -28,3 +29,4 @@ mod stragglers;
 #[path = "../support/cluster.rs"]
 mod support;
 mod web;
+mod webhook;

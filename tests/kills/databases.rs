@@ -43,7 +43,7 @@ fn a_bucket_that_fails_costs_no_task() {
     let Some(mut harness) = Harness::on_database(scenario) else { return };
     harness.start_worker("first");
     let job = harness.submit();
-    job.wait_for_checkpoint("partition-0000");
+    job.wait_until_well_begun("partition-0000");
     let lease = Duration::from_millis(harness.rules.lease_ms);
     // For as long as a coordinator tries a request, and longer.
     harness.bucket().break_every(1, Some(Fault::Status(503)));
@@ -71,7 +71,7 @@ fn one_of_two_coordinators_is_killed_for_good() {
     harness.start_second();
     harness.start_worker("first");
     let job = harness.submit();
-    job.wait_for_checkpoint("partition-0000");
+    job.wait_until_well_begun("partition-0000");
     harness.kill_coordinator();
     let history = harness.succeeded(&job);
     assert_eq!(history.losses(), 0, "a live worker was counted as lost\n{history}");

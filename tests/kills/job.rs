@@ -84,6 +84,14 @@ impl Job {
         event["worker"].as_str().expect("a name").to_owned()
     }
 
+    /// Waits until a task is well under way: it has a checkpoint, or it was done before the first one was
+    /// stored.
+    pub fn wait_until_well_begun(&self, task: &str) {
+        self.wait_for(&format!("a checkpoint or the end of {task}"), |event| {
+            event["task"] == task && (event["event"] == "checkpoint" || event["state"] == "done")
+        });
+    }
+
     /// Waits for the first checkpoint of a task; returns its iteration.
     pub fn wait_for_checkpoint(&self, task: &str) -> u64 {
         let event = self.wait_for(&format!("a checkpoint of {task}"), |event| {

@@ -17,6 +17,11 @@ render() {
         -o "$data/renders/$name/$folder" "$@"
 }
 
+# Range and alpha of each pixel, from which a test fits the water back.
+ranges() {
+    render "$1" ranges --size 600x450 --maps range,alpha
+}
+
 # A copy for viewing, and pages to hand over. The name and the credits try to be markup.
 handover() {
     mkdir -p "$data/handover"
@@ -40,6 +45,7 @@ if [ "${3:-}" = quick ]; then
         render "$name" water --water on
         render "$name" veil --water only
     done
+    ranges pixel
     handover
     exit
 fi
@@ -76,4 +82,6 @@ for name in pixel gaussian gaussian_linear maps open aligned over_black; do
     render "$name" water --water on
     render "$name" veil --water only
 done
+ranges pixel
+ranges open
 handover

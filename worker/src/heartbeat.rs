@@ -41,6 +41,10 @@ pub enum Stop {
 #[derive(Default)]
 struct PulseState {
     lease: Option<v1::Lease>,
+    /// When the lease began.
+    since: Option<Instant>,
+    /// Time until the input was there.
+    fetching: Duration,
     progress: Option<Progress>,
     /// Points of the curves that have not been sent, each with its time.
     measured: Vec<(Instant, Progress)>,
@@ -68,9 +72,12 @@ impl Pulse {
     /// Starts to renew `lease`.
     pub fn begin(&self, lease: v1::Lease) {
         let mut state = self.lock();
-        (state.lease, state.progress, state.stop) = (Some(lease), None, None);
-        state.measured.clear();
-        state.previews.clear();
+        *state = PulseState {
+            lease: Some(lease),
+            since: Some(Instant::now()),
+            renew_every: state.renew_every,
+            ..PulseState::default()
+        };
         drop(state);
         self.begun.notify_one();
     }
@@ -83,9 +90,28 @@ impl Pulse {
         state.previews.clear();
     }
 
-    /// Progress for the next renewal.
-    pub fn report(&self, progress: Progress) {
+    /// The input of the task is there.
+    pub fn has_input(&self) {
         let mut state = self.lock();
+        state.fetching = state.since.map_or(Duration::ZERO, |since| since.elapsed());
+    }
+
+    /// The result was stored after this time: the last point of the curves says so.
+    pub fn has_sent(&self, sending: Duration) {
+        let Some(mut progress) = self.lock().progress else { return };
+        if let Some(spent) = &mut progress.time_spent {
+            spent.sending_seconds = sending.as_secs_f32();
+            self.report(progress);
+        }
+    }
+
+    /// Progress for the next renewal.
+    pub fn report(&self, mut progress: Progress) {
+        let mut state = self.lock();
+        if let Some(spent) = &mut progress.time_spent {
+            spent.seconds = state.since.map_or(0.0, |since| since.elapsed().as_secs_f32());
+            spent.fetching_seconds = state.fetching.as_secs_f32();
+        }
         state.progress = Some(progress);
         if state.measured.len() >= MOST_MEASURED {
             // Every other one: the coordinator does not answer, or training is much faster than renewals.

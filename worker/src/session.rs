@@ -385,6 +385,7 @@ impl Session {
                 return Err(TaskError::Stopped { checkpoint: None });
             }
         };
+        self.pulse.has_input();
         let iterations = input.common.own_iterations();
         let seat = Arc::clone(&self.seat).lock_owned().await;
         let control = Arc::new(TaskControl {
@@ -501,12 +502,14 @@ impl Session {
         started: Instant,
         iterations: u32,
     ) -> Result<(), TaskError> {
+        let begin = Instant::now();
         let blob = self
             .blobs
             .of_job(&lease.job_id)
             .upload(&BlobSource::Bytes(output.result))
             .await
             .map_err(TaskError::environment)?;
+        self.pulse.has_sent(begin.elapsed());
         let request = v1::CompleteRequest {
             lease: Some(lease.clone()),
             result: Some(to_proto(&blob)),

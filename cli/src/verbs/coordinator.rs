@@ -71,6 +71,13 @@ pub struct CoordinatorSettings {
     /// tokens; beyond this machine it needs both [default: nowhere]
     #[arg(long, value_name = "ADDRESS:PORT", env = "FATHOM_WEB", value_parser = super::parse_address)]
     web: Option<SocketAddr>,
+    /// URL for a signed POST request at the end of each new job [default: none]
+    #[arg(long, value_name = "URL", env = "FATHOM_WEBHOOK")]
+    webhook: Option<String>,
+    /// File with the secret that signs these requests [default: webhook.secret in the data folder, made where
+    /// it is missing]
+    #[arg(long, value_name = "FILE", env = "FATHOM_WEBHOOK_SECRET")]
+    webhook_secret: Option<PathBuf>,
     /// Address that tells KEDA how many workers to start; beyond this machine it needs --tls-cert, --tls-key
     /// and --scaler-client-ca [default: nowhere]
     #[arg(long, value_name = "ADDRESS:PORT", env = "FATHOM_SCALER_LISTEN", value_parser = super::parse_address)]

@@ -37,8 +37,8 @@ pub async fn ensure_operator(
 }
 
 /// Writes a file that no other user can read, completely or not at all.
-fn write_secret(path: &Path, secret: &str) -> std::io::Result<()> {
-    let staged = path.with_extension("token.new");
+pub(crate) fn write_secret(path: &Path, secret: &str) -> std::io::Result<()> {
+    let staged = path.with_added_extension("new");
     if staged.exists() {
         std::fs::remove_file(&staged)?;
     }

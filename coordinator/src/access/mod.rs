@@ -14,6 +14,7 @@ use std::str::FromStr;
 use serde::{Deserialize, Serialize};
 
 pub use first::ensure_operator;
+pub(crate) use first::write_secret;
 pub use rate::RateLimit;
 pub use table::{Access, Refused};
 pub use token::{IssueError, Token, TokenRecord};

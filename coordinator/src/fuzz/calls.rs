@@ -128,6 +128,7 @@ impl Coordinator {
         let (stopping, stop_signal) = watch::channel(false);
         let clock = Clock::start();
         let shared = Arc::new(State {
+            has_webhook: false,
             jobs: Arc::clone(&store) as Arc<dyn JobStore>,
             store,
             objects,
@@ -299,6 +300,8 @@ fn fuzzed_calls_of_uploads_are_answered_or_refused() {
     let finish =
         v1::FinishWriteRequest { blob: blob(), upload: blob().unwrap().digest, ..Default::default() };
     corpus.extend([(9, sign.encode_to_vec()), (10, finish.encode_to_vec())]);
+    let inspect = v1::InspectDatasetRequest { dataset_id: "wreck".into(), config_json: "{}".into() };
+    corpus.push((11, inspect.encode_to_vec()));
     fuzz("calls of UploadService", &corpus, async |shared, which, bytes| {
         let uploads = Uploads(Arc::clone(shared));
         match which {
@@ -315,6 +318,8 @@ fn fuzzed_calls_of_uploads_are_answered_or_refused() {
             9 => uploads.sign_write(message(bytes)?).await.ok().map(drop),
             // Nothing is in a bucket here, so each of them is refused.
             10 => uploads.finish_write(message(bytes)?).await.map_or_else(|_| Some(()), |_| None),
+            // Nor is a scene in the dataset.
+            11 => uploads.inspect_dataset(message(bytes)?).await.map_or_else(|_| Some(()), |_| None),
             _ => None,
         }
     });

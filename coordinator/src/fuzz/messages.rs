@@ -72,6 +72,7 @@ fn fuzzed_messages_of_users_are_decoded_or_refused() {
     fuzz(v1::CommitDatasetRequest { dataset_id: "reef".into() });
     fuzz(v1::GetDatasetRequest { dataset_id: "reef".into() });
     fuzz(v1::ListDatasetsRequest { page_size: 7, page_token: "reef/00000000".into() });
+    fuzz(v1::InspectDatasetRequest { dataset_id: "reef".into(), config_json: "{}".into() });
     fuzz(v1::DeleteDatasetRequest { dataset_id: "reef".into() });
     fuzz(v1::QueryBlobRequest { blob: blob(), job_id: job_id() });
     fuzz(v1::SignWriteRequest { blob: blob(), job_id: job_id(), offset_bytes: 0, in_parts: true });

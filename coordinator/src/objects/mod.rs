@@ -185,7 +185,11 @@ impl BlobStore {
         let folder = self.staging();
         for entry in std::fs::read_dir(&folder).map_err(io_error("read", &folder))? {
             let path = entry.map_err(io_error("read", &folder))?.path();
-            std::fs::remove_file(&path).map_err(io_error("remove", &path))?;
+            let removed = match path.is_dir() {
+                true => std::fs::remove_dir_all(&path),
+                false => std::fs::remove_file(&path),
+            };
+            removed.map_err(io_error("remove", &path))?;
             tracing::info!(path = %path.display(), "removed unfinished files of a crashed coordinator");
         }
         Ok(())
@@ -487,6 +491,20 @@ impl BlobStore {
             Place::Disk(disk) => check_disk(&disk.root, self.min_free_bytes, bytes).await,
             Place::Bucket(_) => Ok(()),
         }
+    }
+
+    /// Refuses if copies of `bytes` of its blobs in the local folder would leave too little free. On a disk,
+    /// another name of a blob is enough.
+    pub async fn check_staging(&self, bytes: u64) -> Result<(), ObjectError> {
+        match &self.place {
+            Place::Disk(disk) => check_disk(&disk.root, self.min_free_bytes, 0).await,
+            Place::Bucket(bucket) => check_disk(&bucket.staging, self.min_free_bytes, bytes).await,
+        }
+    }
+
+    /// Whether its blobs are files of a local disk.
+    pub fn is_on_disk(&self) -> bool {
+        matches!(self.place, Place::Disk(_))
     }
 
     /// Removes blobs and uploads that were last used or written before `before`, except the blobs `used`.

@@ -10,7 +10,7 @@ pub mod evaluation;
 pub mod exchange;
 pub mod input;
 mod merge;
-mod plan;
+pub mod plan;
 
 use std::sync::Arc;
 use std::time::Duration;

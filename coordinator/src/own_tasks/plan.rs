@@ -36,19 +36,7 @@ pub async fn plan_job(
     let config = input.config.clone();
     let Drawn { plan, plan_json, plan_png, centres } = draw(objects, job, input, connected).await?;
     tracing::info!(job = %job.job_id, partitions = plan.partitions.len(), reason = plan.cut.reason, "partitioned the scene");
-    let mut warnings = plan.warnings(&config.train);
-    if config.water.partitions == WaterPartitions::Joint
-        && !config.water.is_joint_for(plan.partitions.len() as u32)
-    {
-        warnings.push(
-            "water.partitions = \"joint\" has no effect here: it needs more than one partition and a medium"
-                .into(),
-        );
-    }
-    if config.borders.enabled && plan.borders.is_none() {
-        warnings.push("borders.enabled has no effect here: it needs more than one partition".into());
-    }
-    warnings.extend(warning_of_defaults(&plan, connected, &config.partition));
+    let warnings = warnings_of(&plan, &config, connected);
     let mut tasks = put_partitions(objects, &plan, &config, &centres).await?;
     let own = |stage: Stage| (stage.task(), PlannedTask::default());
     if let Some(stage) = &plan.global {
@@ -85,6 +73,24 @@ pub async fn plan_job(
     Ok(TaskOutput::planned(plan_blob, picture, Planned { tasks, warnings }))
 }
 
+/// What is unusual about a plan; a sentence each.
+pub fn warnings_of(plan: &Plan, config: &JobConfig, connected: Connected) -> Vec<String> {
+    let mut warnings = plan.warnings(&config.train);
+    if config.water.partitions == WaterPartitions::Joint
+        && !config.water.is_joint_for(plan.partitions.len() as u32)
+    {
+        warnings.push(
+            "water.partitions = \"joint\" has no effect here: it needs more than one partition and a medium"
+                .into(),
+        );
+    }
+    if config.borders.enabled && plan.borders.is_none() {
+        warnings.push("borders.enabled has no effect here: it needs more than one partition".into());
+    }
+    warnings.extend(warning_of_defaults(plan, connected, &config.partition));
+    warnings
+}
+
 /// What `partition.auto` assumed because no worker was connected and the configuration does not say it.
 fn warning_of_defaults(plan: &Plan, connected: Connected, config: &PartitionConfig) -> Option<String> {
     let planned_for = plan.cut.planned_for.filter(|_| connected.workers == 0)?;
@@ -103,6 +109,19 @@ fn warning_of_defaults(plan: &Plan, connected: Connected, config: &PartitionConf
             settings.join(" and ")
         )
     })
+}
+
+/// The plan of a scene, and its views.
+pub fn planned(
+    input: &JobInput,
+    points: &Points,
+    connected: Connected,
+) -> Result<(Plan, Vec<TrainView>), OwnTaskError> {
+    let views = input.views()?;
+    let plan_input = PlanInput { views: &views, points, config: &input.config };
+    let plan = plan_for(&plan_input, connected).map_err(|e| OwnTaskError::input(e.to_string()))?;
+    plan.require_points().map_err(|e| OwnTaskError::input(e.to_string()))?;
+    Ok((plan, views))
 }
 
 /// A plan, as JSON and as a picture.
@@ -125,10 +144,7 @@ async fn draw(
     let title = job.name.clone();
     blocking(move || {
         let points = Points::from_bytes(&points).map_err(|e| OwnTaskError::input(e.to_string()))?;
-        let views = input.views()?;
-        let plan_input = PlanInput { views: &views, points: &points, config: &input.config };
-        let plan = plan_for(&plan_input, connected).map_err(|e| OwnTaskError::input(e.to_string()))?;
-        plan.require_points().map_err(|e| OwnTaskError::input(e.to_string()))?;
+        let (plan, views) = planned(&input, &points, connected)?;
         let plan_json = serde_json::to_vec_pretty(&plan).map_err(|e| OwnTaskError::failed(e.to_string()))?;
         let plan_png = picture::draw(&plan, &views, &points, &title).map_err(OwnTaskError::failed)?;
         let centre = |view: &TrainView| plan.alignment.to_aligned(view.pose.centre().as_vec3().to_array());

@@ -193,6 +193,20 @@ pub enum Event {
     Resume,
     /// The user retries a failed job.
     Retry,
+    /// A coordinator is about to tell the webhook of the job's end.
+    Announce {
+        /// [`super::JobRecord::ended_ms`] of that end.
+        ended_ms: u64,
+        /// The time in [`super::Announcement::Due`] that the coordinator knows.
+        known_ms: u64,
+        /// No other coordinator does before this time, Unix milliseconds.
+        until_ms: u64,
+    },
+    /// The webhook knows of the job's end.
+    Announced {
+        /// As above.
+        ended_ms: u64,
+    },
     /// The user changes settings of the job.
     Update {
         /// See [`super::JobRecord::priority`]; `None` keeps the current value.

@@ -150,6 +150,9 @@ pub struct JobRecord {
     pub created_ms: u64,
     /// End, Unix milliseconds.
     pub ended_ms: Option<u64>,
+    /// Whether the webhook knows of its end.
+    #[serde(default, skip_serializing_if = "Announcement::is_not_wanted")]
+    pub announcement: Announcement,
     /// Why it failed or was cancelled.
     pub error: String,
     /// Number of its durable events.
@@ -164,6 +167,31 @@ pub struct JobRecord {
     pub iterations_done: u64,
     /// Duration of finished stages, without pauses, seconds.
     pub stage_seconds: BTreeMap<Stage, f64>,
+}
+
+/// Whether the end of a job was announced to the webhook.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Announcement {
+    /// There was no webhook when the job was created.
+    #[default]
+    NotWanted,
+    /// Its end has to be announced.
+    Due {
+        /// A coordinator is at it until then, Unix milliseconds; 0 where none is.
+        not_before_ms: u64,
+    },
+    /// It was announced, or given up.
+    Made,
+}
+
+impl Announcement {
+    /// Nobody announces it yet.
+    pub const DUE: Self = Self::Due { not_before_ms: 0 };
+
+    fn is_not_wanted(&self) -> bool {
+        *self == Self::NotWanted
+    }
 }
 
 impl JobRecord {

@@ -26,7 +26,7 @@ pub use event::{
 };
 pub use fit::{Requirements, Shortfall, WorkerProfile};
 pub use ids::{JobId, ParseIdError, TaskId};
-pub use job::{JobRecord, JobShape, JobState};
+pub use job::{Announcement, JobRecord, JobShape, JobState};
 pub use leases::{LeaseTable, LiveProgress, Renewed};
 pub use queue::{Next, OpenWork, Queue, ReadyTask, Usage};
 pub use rows::{JobRows, Rules};

@@ -8,7 +8,7 @@ use fathom_core::scene::BlobRef;
 use super::event::{
     Event, EventBody, Expired, FailClass, Outcome, Planned, PlannedTask, Refusal, TaskChange, TaskOutput,
 };
-use super::job::{JobRecord, JobShape, JobState};
+use super::job::{Announcement, JobRecord, JobShape, JobState};
 use super::lost_results::requeue_lost;
 use super::rows::{JobRows, Rules, attempt_event, end_job, given_up, task_event};
 use super::task::{Attempt, CheckpointRecord, Lease, TaskRecord, TaskState};
@@ -44,7 +44,11 @@ pub fn rows_needed(job: &JobRecord, event: &Event) -> RowsNeeded {
         | Event::Retry
         | Event::ResultsLost { .. }
         | Event::GiveUp { .. } => RowsNeeded::All,
-        Event::Pause { .. } | Event::Resume | Event::Update { .. } => RowsNeeded::Some(Vec::new()),
+        Event::Pause { .. }
+        | Event::Resume
+        | Event::Update { .. }
+        | Event::Announce { .. }
+        | Event::Announced { .. } => RowsNeeded::Some(Vec::new()),
     }
 }
 
@@ -202,6 +206,20 @@ pub fn step(rows: &mut JobRows, event: Event, now_ms: u64, rules: &Rules) -> Res
             JobState::Running | JobState::Paused => return Ok(Outcome::Already),
             JobState::Succeeded => return Err(Refusal::NotFailed("succeeded")),
             JobState::Cancelled => return Err(Refusal::NotFailed("been cancelled")),
+        },
+        Event::Announce { ended_ms, known_ms, until_ms } => match rows.job.announcement {
+            Announcement::Due { not_before_ms }
+                if rows.job.ended_ms == Some(ended_ms) && not_before_ms == known_ms =>
+            {
+                rows.job.announcement = Announcement::Due { not_before_ms: until_ms };
+            }
+            _ => return Ok(Outcome::Already),
+        },
+        Event::Announced { ended_ms } => match rows.job.announcement {
+            Announcement::Due { .. } if rows.job.ended_ms == Some(ended_ms) => {
+                rows.job.announcement = Announcement::Made;
+            }
+            _ => return Ok(Outcome::Already),
         },
         Event::Update { priority, max_parallel } => {
             let job = &mut rows.job;
@@ -427,6 +445,9 @@ fn retry(rows: &mut JobRows, now_ms: u64, events: &mut Vec<EventBody>) {
     job.state = JobState::Running;
     (job.stage_since_ms, job.paused_since_ms) = (now_ms, None);
     job.ended_ms = None;
+    if job.announcement == Announcement::Made {
+        job.announcement = Announcement::DUE;
+    }
     job.error.clear();
     events.push(EventBody::JobState { state: JobState::Running, message: "retried".to_owned() });
 }

@@ -245,6 +245,17 @@ fn task(record: &TaskRecord, live: Option<&LiveProgress>) -> v1::Task {
         seconds,
         memory_bytes: record.memory_bytes,
         second_worker: record.second.as_ref().map(|second| second.worker.clone()).unwrap_or_default(),
+        model: model_of(record),
+    }
+}
+
+/// The Gaussians that a task has made.
+pub fn model_of(record: &TaskRecord) -> Option<v1::BlobRef> {
+    let makes_model =
+        matches!(record.task.stage, Stage::Global | Stage::Partition | Stage::Merge | Stage::Borders);
+    match &record.state {
+        TaskState::Done { result, .. } if makes_model => Some(blob(result)),
+        _ => None,
     }
 }
 

@@ -10,7 +10,7 @@ use futures::stream::BoxStream;
 use tonic::{Request, Response, Status, async_trait};
 use uuid::Uuid;
 
-use super::{datasets, encode, links, logs, manifests, watch};
+use super::{datasets, encode, inspection, links, logs, manifests, watch};
 use crate::access::Principal;
 use crate::access::guard::caller;
 use crate::capacity::{self, Gap};
@@ -88,16 +88,24 @@ impl Jobs {
         check_priority(priority)?;
         check_request_id(&request_id)?;
         check_line("name", &name, MAX_NAME_BYTES)?;
-        limit_of("config_json", &config_json, MAX_CONFIG_BYTES)?;
         let tenant = caller.home();
         let dataset = match dataset_id.as_str() {
             "" => None,
             id => Some(datasets::committed(&self.0, &tenant, &id.parse()?).await?),
         };
-        let of_dataset = || dataset.as_ref().and_then(|(_, list)| datasets::manifest_in(&list.value));
-        let manifest = encode::required_blob("manifest", manifest.or_else(of_dataset))?;
+        let config_json = resolve_config(&config_json)?;
         let objects = self.0.objects.of(&tenant).await?;
         let (dataset, list) = dataset.map(|(dataset, list)| (dataset.id, list)).unzip();
+        let of_dataset = || list.as_ref().and_then(|list| datasets::manifest_in(&list.value));
+        let (manifest, list) = match (manifest.or_else(of_dataset), list) {
+            (None, Some(list)) => {
+                self.0.objects.check_space(0).await?;
+                self.0.check_bytes(&tenant, 0).await?;
+                // What it names is in the dataset.
+                (inspection::manifest_of(&objects, list, &config_of(&config_json)?).await?, None)
+            }
+            (manifest, list) => (encode::required_blob("manifest", manifest)?, list),
+        };
         manifests::check(&objects, &manifest, list).await?;
         self.0.objects.check_space(0).await?;
         self.0.check_bytes(&tenant, 0).await?;
@@ -106,11 +114,12 @@ impl Jobs {
             tenant,
             request_id,
             name,
-            config_json: resolve_config(&config_json)?,
+            config_json,
             manifest,
             dataset,
             priority,
             max_parallel,
+            announce: self.0.has_webhook,
             ingest_seconds: if ingest_seconds.is_finite() { ingest_seconds.max(0.0) } else { 0.0 },
         };
         let job = self.0.jobs.submit(new, self.0.clock.now_ms()).await?;
@@ -333,10 +342,19 @@ impl JobService for Jobs {
 
 /// The configuration with every default written out, so that a stored job does not change with the defaults.
 fn resolve_config(json: &str) -> Result<String, ServiceError> {
-    let fault = |message: String| ServiceError::BadArgument { field: "config_json", message };
-    let config = JobConfig::from_json(json).map_err(|e| fault(e.to_string()))?;
-    config.validate().map_err(|e| fault(e.to_string()))?;
-    serde_json::to_string(&config).map_err(|e| fault(e.to_string()))
+    serde_json::to_string(&config_of(json)?).map_err(|e| bad_config(e.to_string()))
+}
+
+/// The settings of a job from a request.
+pub fn config_of(json: &str) -> Result<JobConfig, ServiceError> {
+    limit_of("config_json", json, MAX_CONFIG_BYTES)?;
+    let config = JobConfig::from_json(json).map_err(|e| bad_config(e.to_string()))?;
+    config.validate().map_err(|e| bad_config(e.to_string()))?;
+    Ok(config)
+}
+
+fn bad_config(message: String) -> ServiceError {
+    ServiceError::BadArgument { field: "config_json", message }
 }
 
 fn check_priority(priority: i32) -> Result<(), ServiceError> {

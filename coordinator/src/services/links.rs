@@ -76,7 +76,7 @@ pub struct Links {
 
 /// Jobs whose files are remembered.
 const REMEMBERED: usize = 16;
-/// Previews are looked up again after this time.
+/// Files that come while a job runs are looked up again after this time.
 const LOOK_AGAIN_AFTER_MS: u64 = 2000;
 
 /// The digests of the files of a job, 32 bytes each.
@@ -85,7 +85,8 @@ struct Readable {
     /// The lists that name the files: the manifest and, once the job has succeeded, the index of its results.
     lists: Vec<BlobRef>,
     files: HashSet<[u8; 32]>,
-    previews: HashSet<[u8; 32]>,
+    /// Previews, and the models of tasks, which come while the job runs.
+    on_the_way: HashSet<[u8; 32]>,
     looked_ms: Option<u64>,
 }
 
@@ -120,19 +121,21 @@ pub async fn check_read(
         }
         *known = Readable { lists, files, ..Readable::default() };
     }
-    if known.files.contains(&wanted) || known.previews.contains(&wanted) {
+    if known.files.contains(&wanted) || known.on_the_way.contains(&wanted) {
         return Ok(());
     }
     let now_ms = shared.clock.now_ms();
     if known.looked_ms.is_none_or(|looked_ms| looked_ms.saturating_add(LOOK_AGAIN_AFTER_MS) <= now_ms) {
         let previews =
             history::of_job(shared, job, None).await?.tasks.into_iter().flat_map(|task| task.previews);
-        let blobs = previews.flat_map(|preview| [preview.render, preview.clear]).flatten();
+        let pictures = previews.flat_map(|preview| [preview.render, preview.clear]).flatten();
+        let tasks = shared.jobs.job(job).await?.tasks;
+        let blobs = pictures.chain(tasks.iter().filter_map(|(record, _)| encode::model_of(record)));
         let digest = |blob: v1::BlobRef| Some(*blake3::Hash::from_hex(&blob.digest).ok()?.as_bytes());
-        known.previews = blobs.filter_map(digest).collect();
+        known.on_the_way = blobs.filter_map(digest).collect();
         known.looked_ms = Some(now_ms);
     }
-    if known.previews.contains(&wanted) { Ok(()) } else { Err(none()) }
+    if known.on_the_way.contains(&wanted) { Ok(()) } else { Err(none()) }
 }
 
 /// All digests in a text: its runs of 64 hex digits.

@@ -16,8 +16,8 @@ use crate::service_error::ServiceError;
 /// Memory of a manifest and its parsed form, as a multiple of its length.
 const MANIFEST_TAKES: u64 = 3;
 
-/// Refuses a manifest that cannot be read, or that names missing blobs or files outside of its dataset. The
-/// named blobs are young when this returns, so they are not collected before the job references them.
+/// Refuses a manifest that cannot be read, or that names missing blobs or photographs outside its dataset.
+/// The named blobs are young when this returns, so they are not collected before the job references them.
 ///
 /// # Errors
 /// When it is refused, with the missing files.
@@ -49,7 +49,7 @@ pub async fn check(
             let name = view.name;
             std::iter::once(view.image).chain(view.mask).map(move |blob| (name.clone(), blob))
         });
-        named.extend(of_views.chain([("the sparse points".to_owned(), manifest.points)]));
+        named.extend(of_views);
         named.retain(|(_, blob)| seen.insert(blob.clone()));
         if let Some(list) = of_dataset {
             let wanted: HashSet<(&str, u64)> =
@@ -65,6 +65,8 @@ pub async fn check(
                 return Err(format!("names {name}, which is not among the files of the dataset"));
             }
         }
+        // The coordinator makes them from the files of a dataset, so they need not be among these.
+        named.push(("the sparse points".to_owned(), manifest.points));
         // Also for a dataset: it keeps its files, but a disk may have lost one, and the job would fail later.
         Ok(named)
     });

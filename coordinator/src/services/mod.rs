@@ -4,6 +4,7 @@ mod admin;
 mod backup;
 mod datasets;
 pub mod encode;
+mod inspection;
 mod jobs;
 pub mod links;
 pub mod logs;

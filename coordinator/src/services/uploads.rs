@@ -11,7 +11,7 @@ use futures::stream::{self, BoxStream};
 use futures::{Stream, StreamExt};
 use tonic::{Code, Request, Response, Status, Streaming, async_trait};
 
-use super::{datasets, encode, links};
+use super::{datasets, encode, inspection, links};
 use crate::access::guard::caller;
 use crate::access::{Principal, Role};
 use crate::metrics::Metrics;
@@ -386,6 +386,14 @@ impl UploadService for Uploads {
     ) -> Result<Response<v1::ListDatasetsResponse>, Status> {
         let caller = caller(&request)?;
         Ok(Response::new(datasets::list(&self.0, &caller, request.get_ref()).await?))
+    }
+
+    async fn inspect_dataset(
+        &self,
+        request: Request<v1::InspectDatasetRequest>,
+    ) -> Result<Response<v1::Inspection>, Status> {
+        let caller = caller(&request)?;
+        Ok(Response::new(inspection::inspect(&self.0, &caller, request.into_inner()).await?))
     }
 
     async fn delete_dataset(

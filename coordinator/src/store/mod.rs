@@ -38,8 +38,9 @@ use crate::access::TokenRecord;
 use crate::datasets::{DatasetId, DatasetRecord, MAX_DATASETS, NewDataset};
 use crate::logs::Logs;
 use crate::schedule::{
-    Attempt, Event, EventBody, Expired, FailClass, JobId, JobRecord, JobShape, JobState, Lease, LiveProgress,
-    Outcome, Quota, Renewed, Stage, TaskId, TaskOutput, TaskRecord, TaskState, Tenant, Usage, WorkerProfile,
+    Announcement, Attempt, Event, EventBody, Expired, FailClass, JobId, JobRecord, JobShape, JobState, Lease,
+    LiveProgress, Outcome, Quota, Renewed, Stage, TaskId, TaskOutput, TaskRecord, TaskState, Tenant, Usage,
+    WorkerProfile,
 };
 pub use crate::schedule::{OpenWork, ReadyTask};
 
@@ -94,6 +95,8 @@ pub struct NewJob {
     pub priority: i32,
     /// See [`JobRecord::max_parallel`].
     pub max_parallel: u32,
+    /// Whether its end is announced to the webhook.
+    pub announce: bool,
 }
 
 #[cfg(test)]
@@ -111,6 +114,7 @@ impl NewJob {
             ingest_seconds: 0.5,
             priority: 0,
             max_parallel: 0,
+            announce: false,
         }
     }
 }
@@ -138,6 +142,7 @@ impl NewJob {
             max_parallel: self.max_parallel,
             created_ms: now_ms,
             ended_ms: None,
+            announcement: if self.announce { Announcement::DUE } else { Announcement::NotWanted },
             error: String::new(),
             last_seq: 1,
             shape: JobShape::unplanned(),

@@ -199,6 +199,7 @@ pub fn blob(name: &str) -> BlobRef {
 
 pub fn new_job(request: &str, job_id: JobId) -> NewJob {
     NewJob {
+        announce: false,
         job_id,
         tenant: Tenant::default(),
         request_id: request.to_owned(),

@@ -69,6 +69,12 @@ pub fn dimensions_of_complete(path: &Path) -> Result<(u32, u32)> {
     let mut tail = Vec::new();
     file.read_to_end(&mut tail).map_err(io())?;
     if !tail.windows(2).any(|pair| pair == [0xFF, 0xD9]) {
+        // Many pictures are checked at a time, and anybody may have made them.
+        const MOST: u64 = 256 << 20;
+        if len > MOST {
+            let message = format!("the JPEG has {len} bytes and no end marker near its end; export it anew");
+            return Err(CoreError::input(path, message));
+        }
         let bytes = std::fs::read(path).map_err(io())?;
         check_jpeg_end(&bytes).map_err(|message| CoreError::input(path, message))?;
     }

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use super::assemble::{Draft, DraftView};
 use super::camera::MAX_COORDINATE;
-use super::{Camera, Points, Pose, Purpose, colmap_binary, colmap_text};
+use super::{Camera, Points, Pose, Purpose, Reach, colmap_binary, colmap_text};
 use crate::{CoreError, Result};
 
 /// One image as a model lists it.
@@ -156,7 +156,7 @@ fn refuse_half_a_model(folder: &Path) -> Result<()> {
 }
 
 /// Reads the model with the most images; the first of equals.
-pub(super) fn read(root: &Path, models: &[Model], purpose: Purpose) -> Result<Draft> {
+pub(super) fn read(root: &Path, models: &[Model], purpose: Purpose, reach: Reach) -> Result<Draft> {
     let counts = models.iter().map(Model::image_count).collect::<Result<Vec<u64>>>()?;
     let Some(chosen) = (0..models.len()).min_by_key(|index| (std::cmp::Reverse(counts[*index]), *index))
     else {
@@ -236,7 +236,7 @@ pub(super) fn read(root: &Path, models: &[Model], purpose: Purpose) -> Result<Dr
         cameras_file,
         views_file: images_file,
         points_file,
-        image_folders: image_folders(root, &model.folder),
+        image_folders: image_folders(root, &model.folder, reach),
         cameras,
         views,
         points,
@@ -246,11 +246,11 @@ pub(super) fn read(root: &Path, models: &[Model], purpose: Purpose) -> Result<Dr
 
 /// Candidate folders of the photographs: `images/` in the given folder, beside the model and above it; then
 /// the given folder itself. Folders above the given one only count if it is a part of a dataset.
-fn image_folders(root: &Path, model: &Path) -> Vec<PathBuf> {
+fn image_folders(root: &Path, model: &Path, reach: Reach) -> Vec<PathBuf> {
     let is_part = model == root || root.ends_with("sparse") || root.ends_with("colmap");
     let up_to_root = model.strip_prefix(root).map_or(0, |inner| inner.components().count());
     // dataset/colmap/sparse/0 is the deepest usual location: three steps up.
-    let levels = if is_part { 3 } else { up_to_root };
+    let levels = if is_part && reach == Reach::Anywhere { 3 } else { up_to_root };
     let mut folders = vec![root.join("images")];
     let above = model.ancestors().take(levels + 1).map(|up| up.join("images"));
     folders.extend(above.filter(|folder| *folder != root.join("images")));

@@ -3,6 +3,8 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
+use icu_normalizer::ComposingNormalizerBorrowed;
+
 use crate::paths::check_inside;
 use crate::{CoreError, Result};
 
@@ -25,9 +27,10 @@ pub(super) fn sorted_entries(folder: &Path) -> Result<Vec<PathBuf>> {
     Ok(paths)
 }
 
-/// All files below a folder by their relative path in lower case, `/` between folders.
+/// All files below a folder by their relative path in lower case and in Unicode's form NFC, `/` between
+/// folders. Systems differ in both: a Mac writes "é" as two characters.
 ///
-/// If names differ in case only, the first by name wins.
+/// If names differ in case or form only, the first by name wins.
 pub(super) struct FileIndex {
     files: BTreeMap<String, PathBuf>,
 }
@@ -41,7 +44,7 @@ impl FileIndex {
         while let Some((folder, prefix, depth)) = open.pop() {
             for path in sorted_entries(&folder)? {
                 let Some(name) = path.file_name().and_then(|name| name.to_str()) else { continue };
-                let key = format!("{prefix}{}", name.to_lowercase());
+                let key = format!("{prefix}{}", folded(name));
                 if path.is_dir() {
                     if depth < MAX_DEPTH {
                         open.push((path, format!("{key}/"), depth + 1));
@@ -59,7 +62,7 @@ impl FileIndex {
     }
 
     pub fn get(&self, relative: &str) -> Option<&Path> {
-        self.files.get(&relative.to_lowercase()).map(PathBuf::as_path)
+        self.files.get(&folded(relative)).map(PathBuf::as_path)
     }
 
     /// The mask of the photograph `name`: `img.jpg.png` as COLMAP writes, `img.png`, `img.mask.png`, or its
@@ -70,6 +73,10 @@ impl FileIndex {
             .iter()
             .find_map(|candidate| self.get(candidate))
     }
+}
+
+fn folded(name: &str) -> String {
+    ComposingNormalizerBorrowed::new_nfc().normalize(name).to_lowercase()
 }
 
 /// A name without its extension.
@@ -104,6 +111,18 @@ mod tests {
         assert_eq!(check_name("left cam/frame 12.JPG"), Ok(()));
         assert!(check_name("a/../../b.jpg").is_err_and(|fault| fault.contains("without \"..\"")));
         assert!(check_name(&"a".repeat(1 << 20)).is_err_and(|fault| fault.len() < 200));
+    }
+
+    #[test]
+    fn a_file_is_found_under_any_spelling_of_its_name() {
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::create_dir(folder.path().join("r\u{e9}cif")).unwrap();
+        std::fs::write(folder.path().join("r\u{e9}cif/Caf\u{e9}.JPG"), "x").unwrap();
+        let index = FileIndex::of(folder.path()).unwrap();
+        for name in ["r\u{e9}cif/caf\u{e9}.jpg", "re\u{301}cif/Cafe\u{301}.JPG"] {
+            assert!(index.get(name).is_some_and(Path::is_file), "{name:?}");
+        }
+        assert_eq!(index.get("recif/Cafe.JPG"), None);
     }
 
     #[test]

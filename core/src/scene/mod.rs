@@ -59,8 +59,31 @@ pub enum Purpose {
 /// [`CoreError::Input`] with the file, the place in it, the fault and the remedy.
 pub fn load_scene(path: &Path, purpose: Purpose, options: &DataConfig) -> Result<Scene> {
     let root = std::fs::canonicalize(path).map_err(CoreError::io("read", path))?;
-    let draft = if root.is_file() { read_file(&root, purpose)? } else { read_folder(&root, purpose)? };
+    let draft = match root.is_file() {
+        true => read_file(&root, purpose)?,
+        false => read_folder(&root, purpose, Reach::Anywhere)?,
+    };
     assemble::assemble(draft, purpose, options)
+}
+
+/// Reads the scene in the folder `root` for training, where its files come from somebody else. A path in them
+/// that leaves the folder is refused before anything is read there. The folder must have no links.
+///
+/// # Errors
+/// As [`load_scene`].
+pub fn load_foreign_scene(root: &Path, options: &DataConfig) -> Result<Scene> {
+    let root = std::fs::canonicalize(root).map_err(CoreError::io("read", root))?;
+    let draft = read_folder(&root, Purpose::Train, Reach::Inside)?;
+    assemble::assemble(draft, Purpose::Train, options)
+}
+
+/// Where the files of a scene may be.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Reach {
+    /// Where its owner says: the process reads with the owner's rights.
+    Anywhere,
+    /// In the folder of the scene.
+    Inside,
 }
 
 fn read_file(file: &Path, purpose: Purpose) -> Result<assemble::Draft> {
@@ -68,7 +91,7 @@ fn read_file(file: &Path, purpose: Purpose) -> Result<assemble::Draft> {
     let bytes = std::fs::read(file).map_err(CoreError::io("read", file))?;
     match bytes.iter().find(|byte| !byte.is_ascii_whitespace()) {
         Some(b'[') => cameras_json::read(file, file, purpose),
-        Some(b'{') => nerfstudio::read(file, file, purpose),
+        Some(b'{') => nerfstudio::read(file, file, purpose, Reach::Anywhere),
         _ if bytes.starts_with(b"ply") => Err(CoreError::input(
             file,
             "is a PLY; a scene consists of photographs or cameras; use models with `fathom render` and `fathom eval`",
@@ -80,12 +103,12 @@ fn read_file(file: &Path, purpose: Purpose) -> Result<assemble::Draft> {
     }
 }
 
-fn read_folder(root: &Path, purpose: Purpose) -> Result<assemble::Draft> {
+fn read_folder(root: &Path, purpose: Purpose, reach: Reach) -> Result<assemble::Draft> {
     let models = colmap::find_models(root)?;
     let json = |name: &str| Some(root.join(name)).filter(|file| file.is_file());
     let transforms = json("transforms.json").or_else(|| json("transforms_train.json"));
     if !models.is_empty() {
-        let mut draft = colmap::read(root, &models, purpose)?;
+        let mut draft = colmap::read(root, &models, purpose, reach)?;
         if let Some(file) = transforms {
             draft.warnings.push(format!(
                 "using the COLMAP model, not {}; give that file itself to use it",
@@ -95,7 +118,7 @@ fn read_folder(root: &Path, purpose: Purpose) -> Result<assemble::Draft> {
         return Ok(draft);
     }
     if let Some(file) = transforms {
-        return nerfstudio::read(root, &file, purpose);
+        return nerfstudio::read(root, &file, purpose, reach);
     }
     if let Some(file) = json("cameras.json") {
         return cameras_json::read(root, &file, purpose);

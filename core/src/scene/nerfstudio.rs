@@ -13,7 +13,8 @@ use super::assemble::{Draft, DraftView};
 use super::camera::MAX_COORDINATE;
 use super::distinct::DistinctCameras;
 use super::files::name_of;
-use super::{Camera, CameraModel, Points, Pose, Purpose, point_cloud};
+use super::{Camera, CameraModel, Points, Pose, Purpose, Reach, point_cloud};
+use crate::paths::check_inside;
 use crate::{CoreError, Result, picture};
 
 #[derive(Deserialize)]
@@ -55,12 +56,15 @@ struct Intrinsics {
     p2: Option<f64>,
 }
 
-pub(super) fn read(root: &Path, file: &Path, purpose: Purpose) -> Result<Draft> {
+pub(super) fn read(root: &Path, file: &Path, purpose: Purpose, reach: Reach) -> Result<Draft> {
     let bytes = std::fs::read(file).map_err(CoreError::io("read", file))?;
     // Python writes NaN and Infinity, which are not JSON; serde_json then names line and column.
     let transforms: Transforms = serde_json::from_slice(&bytes)
         .map_err(|error| CoreError::input(file, format!("not a usable transforms.json: {error}")))?;
     let folder = file.parent().unwrap_or(root).to_owned();
+    if reach == Reach::Inside {
+        check_paths(&transforms).map_err(|message| CoreError::input(file, message))?;
+    }
 
     let mut warnings = Vec::new();
     if transforms.applied_transform.is_some() || transforms.applied_scale.is_some_and(|scale| scale != 1.0) {
@@ -124,6 +128,28 @@ pub(super) fn read(root: &Path, file: &Path, purpose: Purpose) -> Result<Draft> 
         points,
         warnings,
     })
+}
+
+/// Refuses paths that leave the folder of the file, and points under another ending: their length is checked
+/// by it.
+fn check_paths(transforms: &Transforms) -> std::result::Result<(), String> {
+    let check = |place: String, path: &str| {
+        // Only the beginning of a long path is shown.
+        let shown = || path.chars().take(80).collect::<String>();
+        check_inside(path.strip_prefix("./").unwrap_or(path)).map_err(|fault| {
+            format!("{place} \"{}\" {fault}; every path must be inside the dataset", shown().escape_debug())
+        })
+    };
+    for (index, frame) in transforms.frames.iter().enumerate() {
+        check(format!("frames[{index}]: file_path"), &frame.file_path)?;
+        if let Some(path) = &frame.mask_path {
+            check(format!("frames[{index}]: mask_path"), path)?;
+        }
+    }
+    let Some(path) = &transforms.ply_file_path else { return Ok(()) };
+    check("ply_file_path".to_owned(), path)?;
+    let is_ply = Path::new(path).extension().is_some_and(|ending| ending.eq_ignore_ascii_case("ply"));
+    if is_ply { Ok(()) } else { Err("ply_file_path must end in .ply".to_owned()) }
 }
 
 /// The photograph of a frame; without an extension it is a PNG, as in synthetic NeRF data.

@@ -1,5 +1,7 @@
 //! Results of a run so far: Gaussians, water, exposures, embeddings; and its memory use.
 
+use std::time::Duration;
+
 use super::{DeviceMedium, Exposures, Film, FilmEmbedding, MediumRun, MemoryUse, Predictor, Trainer};
 use crate::Result;
 use crate::gpu::{Blocks, Output, WaterView};
@@ -66,6 +68,11 @@ impl Trainer {
     pub fn water_steps_left_out(&self) -> Result<u32> {
         let of_water = self.appearances.water().map_or(Ok(0), |medium| medium.steps_left_out(&self.gpu))?;
         Ok(of_water + self.predictor.as_ref().map_or(0, Predictor::steps_left_out))
+    }
+
+    /// How long the run has waited for photographs that were not read yet.
+    pub fn waited_for_photographs(&self) -> Duration {
+        self.targets.waited()
     }
 
     /// Device memory in use.

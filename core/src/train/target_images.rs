@@ -7,6 +7,7 @@
 use std::collections::{HashMap, VecDeque};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
 
 use crate::Result;
 use crate::gpu::{DevicePhotograph, Gpu, Spare};
@@ -29,19 +30,25 @@ pub(super) struct TargetImages {
     orders: VecDeque<(u32, Vec<u32>)>,
     resident: Arc<Mutex<Resident>>,
     ahead: Option<Ahead>,
+    /// Time that the run has waited for photographs.
+    waited: Duration,
 }
 
 impl TargetImages {
     /// With 0 threads, nothing is fetched ahead.
     pub(super) fn new(views: Arc<dyn ViewSource>, seed: u32, threads: u32) -> Self {
         let ahead = Ahead::new(&views, threads);
-        Self { views, seed, orders: VecDeque::new(), resident: Arc::default(), ahead }
+        Self { views, seed, orders: VecDeque::new(), resident: Arc::default(), ahead, waited: Duration::ZERO }
     }
 
     /// Lets the photographs kept on a device be dropped when its memory runs short.
     pub(super) fn evictable_on(self, gpu: &Gpu) -> Self {
         gpu.give_way(&self.resident);
         self
+    }
+
+    pub(super) fn waited(&self) -> Duration {
+        self.waited
     }
 
     pub(super) fn views(&self) -> &[TrainView] {
@@ -91,11 +98,11 @@ impl TargetImages {
         if let Some(photograph) = resident {
             return Ok(photograph);
         }
+        let begin = Instant::now();
         let fetched = self.ahead.as_ref().and_then(|ahead| ahead.wait(key));
-        let image = match fetched {
-            Some(image) => image?,
-            None => fetch(&*self.views, key)?,
-        };
+        let image = fetched.unwrap_or_else(|| fetch(&*self.views, key));
+        self.waited += begin.elapsed();
+        let image = image?;
         let photograph = DevicePhotograph::new(gpu, &image)?.with_map(gpu, self.views.map(key.0))?;
         lock(&self.resident).insert(key, photograph.clone());
         Ok(photograph)

@@ -201,6 +201,7 @@ mod tests {
             max_parallel: 0,
             created_ms: 0,
             ended_ms: None,
+            announcement: Default::default(),
             error: String::new(),
             last_seq: events.len() as u64,
             shape: JobShape::unplanned(),

@@ -30,13 +30,13 @@ export const isCommitted = ({ state }: Dataset): boolean => state === DatasetSta
 export const contentText = ({ files, sizeBytes }: Dataset): string =>
     `${files === 1n ? '1 file' : `${countText(files)} files`}, ${bytesText(sizeBytes)}`;
 
-/** How to upload a scene. */
-export function howToUpload({ session }: Context): HTMLElement {
+/** How to upload a scene. `ways` comes before the command for a terminal. */
+export function howToUpload({ session }: Context, ...ways: readonly (Node | string)[]): HTMLElement {
     return h(
         'div',
         { class: 'empty' },
         h('h2', {}, 'No datasets yet'),
-        h('p', {}, 'A dataset is an uploaded scene. Any number of jobs can use it. Upload one from a terminal:'),
+        h('p', {}, 'A dataset is an uploaded scene. Any number of jobs can use it. ', ...ways),
         commandField(session, 'dataset upload DATA --id NAME'),
         h(
             'p',

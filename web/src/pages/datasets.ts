@@ -91,8 +91,19 @@ export function showDatasets(container: HTMLElement, context: Context): void {
     }
     const table = new Table<Dataset>('Datasets', 'datasets', columns, ({ datasetId }) => datasetId);
     const content = h('div', { class: 'card flush' }, h('p', { class: 'loading', role: 'status' }, 'Loading the datasets …'));
+    const none = (): HTMLElement =>
+        session.controls
+            ? howToUpload(
+                  context,
+                  h('a', { href: newJobLink() }, 'Submit a folder'),
+                  ' from this page, or upload one from a terminal:',
+              )
+            : howToUpload(context, 'Upload one from a terminal:');
     const more = h('p', { class: 'soft', hidden: true }, 'To upload another one: ', h('code', {}, 'fathom dataset upload DATA --id NAME'));
-    container.append(h('div', { class: 'head' }, h('h1', { tabindex: -1 }, 'Datasets')), content, more);
+    const submit = h('a', { class: 'button', href: newJobLink() }, 'Submit a folder');
+    submit.hidden = !session.controls;
+    const head = h('div', { class: 'head' }, h('h1', { tabindex: -1 }, 'Datasets'), submit);
+    container.append(head, content, more);
 
     const polling = poll(() => EVERY_MS, signal, async () => {
         try {
@@ -102,7 +113,7 @@ export function showDatasets(container: HTMLElement, context: Context): void {
             table.show(datasets);
             const shown = datasets.length > 0 ? 'table' : 'empty';
             if (content.dataset['shown'] !== shown) {
-                content.replaceChildren(shown === 'table' ? table.element : howToUpload(context));
+                content.replaceChildren(shown === 'table' ? table.element : none());
             }
             content.dataset['shown'] = shown;
             more.hidden = shown === 'empty';

@@ -1,4 +1,4 @@
-// The form for a new job from an uploaded dataset.
+// The form for a new job: from an uploaded dataset, or from a folder that is uploaded here.
 
 import type { Dataset } from '../rpc/fathom/v1/upload_pb.ts';
 import { type Context, problemOf } from './context.ts';
@@ -10,6 +10,9 @@ import { timeText } from './format.ts';
 import { type FormField, WrongForm, configOf, freshUuid, wrongField } from './job-settings.ts';
 import { poll } from './poll.ts';
 import { DATASETS_LINK, jobLink, jobsLink } from './route.ts';
+import { FolderPanel } from './upload/folder-panel.ts';
+import { PlanCheck, type Subject } from './upload/plan-check.ts';
+import './upload/upload.css';
 
 /** Until the first dataset is there, and afterwards. */
 const SOON_MS = 2500;
@@ -54,12 +57,23 @@ function makePartitions(): { readonly row: FormRow; readonly kind: () => 'auto' 
     };
 }
 
-function makeForm(context: Context): { readonly element: HTMLElement; offer(datasets: readonly Dataset[], wanted: string): void } {
+type Source = 'dataset' | 'folder';
+
+interface Form {
+    readonly element: HTMLElement;
+    /** Whether somebody has chosen something that must stay. */
+    readonly isUsed: () => boolean;
+    offer(datasets: readonly Dataset[], wanted: string): void;
+}
+
+/** `onUse` hears when a folder is chosen, or has become a dataset. */
+function makeForm(context: Context, onUse: () => void): Form {
     const { session, signal } = context;
     /** The same for every press of the button, so that they create one job. */
     const requestId = freshUuid();
     const datasetSelect = h('select', { required: true });
-    const dataset = new FormRow('Dataset', datasetSelect);
+    const checkDataset = h('button', { type: 'button', onclick: () => void check.run() }, 'Check');
+    const dataset = new FormRow('Dataset', datasetSelect, '', h('div', { class: 'row' }, checkDataset));
     const name = new FormRow('Name', h('input', { type: 'text', maxlength: 200, autocomplete: 'off' }), 'Empty: the name of the dataset.');
     const preset = new FormRow('Preset', selectInput(PRESETS, 'fathom'), 'The starting point of all settings.');
     const partitions = makePartitions();
@@ -100,44 +114,129 @@ function makeForm(context: Context): { readonly element: HTMLElement; offer(data
         alert.textContent = text;
         alert.hidden = text === '';
     };
-    const refused = (fault: Fault): void => {
-        if (fault.reason === 'DATASET_NOT_FOUND' || fault.reason === 'DATASET_NOT_COMMITTED') {
-            wrong('dataset', fault.message);
-            return;
+    const clear = (): void => {
+        say('');
+        Object.values(rows).forEach((row) => row.say(''));
+    };
+    const configNow = (): string =>
+        configOf({
+            preset: preset.value,
+            partitions: partitions.kind(),
+            columns: partitions.columns(),
+            rows: partitions.rows(),
+            iterations: Number(iterations.value),
+            maxGaussians: Number(maxGaussians.value),
+            hasPreviews: previews.checked,
+            advanced: advanced.value,
+        });
+
+    // Where the scene comes from
+
+    let source: Source = 'folder';
+    const datasetId = (): string =>
+        source === 'dataset' ? datasetSelect.value : (folder.dataset?.datasetId ?? '');
+    const subject = (isLoud: boolean): Subject | null => {
+        if (isLoud) {
+            clear();
         }
+        try {
+            return { datasetId: datasetId(), configJson: configNow() };
+        } catch (error) {
+            if (isLoud && error instanceof WrongForm) {
+                wrong(error.field, error.message);
+            }
+            return null;
+        }
+    };
+    const atFields = (fault: Fault): boolean => {
         const fields = fault.reason === 'BAD_ARGUMENT' ? wrongFieldsOf(fault) : [];
-        if (fields.length === 0) {
-            say(fault.kind === 'lost' ? LOST : fault.reason === 'REQUEST_ID_REUSED' ? REUSED : fault.message);
-        }
         for (const { field, message } of fields) {
             const shown = wrongField(field, message, advanced.value);
             wrong(shown.field, shown.message);
         }
+        return fields.length > 0;
+    };
+    const check = new PlanCheck(context, { subject, refused: atFields });
+    const folder = new FolderPanel(context, {
+        onChosen: () => {
+            choose('folder');
+            check.clear();
+            settings.hidden = false;
+            onUse();
+        },
+        onCommitted: () => {
+            onUse();
+            if (source === 'folder') {
+                void check.run();
+            }
+        },
+    });
+    const kinds = h('div', { class: 'scene-kinds', hidden: true });
+    const radios = (['dataset', 'folder'] as const).map((kind) => {
+        const radio = h('input', { type: 'radio', name: 'source', value: kind, id: freshId() });
+        radio.addEventListener('change', () => {
+            choose(kind);
+            check.clear();
+        });
+        const label = { dataset: 'Already uploaded', folder: 'A folder on this computer' }[kind];
+        kinds.append(h('div', { class: 'check' }, radio, h('label', { for: radio.id }, label)));
+        return radio;
+    });
+    function choose(kind: Source): void {
+        source = kind;
+        radios.forEach((radio) => (radio.checked = radio.value === kind));
+        dataset.element.hidden = kind !== 'dataset';
+        // A hidden field that is required would keep the form from being sent.
+        datasetSelect.disabled = kind !== 'dataset';
+        folder.element.hidden = kind !== 'folder';
+        say('');
+    }
+    choose(source);
+    datasetSelect.addEventListener('change', () => check.clear());
+
+    const refused = (fault: Fault): void => {
+        const isOfDataset = fault.reason === 'DATASET_NOT_FOUND' || fault.reason === 'DATASET_NOT_COMMITTED';
+        if (isOfDataset && source === 'dataset') {
+            wrong('dataset', fault.message);
+        } else if (!atFields(fault)) {
+            say(fault.kind === 'lost' ? LOST : fault.reason === 'REQUEST_ID_REUSED' ? REUSED : fault.message);
+        }
+    };
+    const createJob = async (configJson: string): Promise<string> => {
+        const id = datasetId();
+        const manifest = check.of({ datasetId: id, configJson })?.manifest;
+        const request = {
+            requestId,
+            configJson,
+            datasetId: id,
+            name: name.value === '' ? id : name.value,
+            priority: Number(priority.value),
+            ingestSeconds: source === 'folder' ? folder.seconds : 0,
+        };
+        if (manifest !== undefined) {
+            try {
+                return (await session.api.jobs.createJob({ ...request, manifest })).jobId;
+            } catch (error) {
+                // Nothing kept the manifest of an inspection for long. Without it, the scene is read again.
+                if (faultOf(error).reason !== 'BLOB_NOT_FOUND') {
+                    throw error;
+                }
+            }
+        }
+        return (await session.api.jobs.createJob(request)).jobId;
     };
     const send = async (): Promise<void> => {
-        say('');
-        Object.values(rows).forEach((row) => row.say(''));
+        clear();
+        if (datasetId() === '') {
+            say(folder.isBusy ? 'The upload is not complete yet.' : 'First upload the folder.');
+            folder.focus();
+            return;
+        }
         create.disabled = true;
         try {
-            const configJson = configOf({
-                preset: preset.value,
-                partitions: partitions.kind(),
-                columns: partitions.columns(),
-                rows: partitions.rows(),
-                iterations: Number(iterations.value),
-                maxGaussians: Number(maxGaussians.value),
-                hasPreviews: previews.checked,
-                advanced: advanced.value,
-            });
-            const job = await session.api.jobs.createJob({
-                requestId,
-                configJson,
-                datasetId: dataset.value,
-                name: name.value === '' ? dataset.value : name.value,
-                priority: Number(priority.value),
-            });
+            const id = await createJob(configNow());
             if (!signal.aborted) {
-                location.hash = jobLink(job.jobId);
+                location.hash = jobLink(id);
             }
         } catch (error) {
             if (error instanceof WrongForm) {
@@ -149,10 +248,9 @@ function makeForm(context: Context): { readonly element: HTMLElement; offer(data
         create.disabled = false;
     };
 
-    const element = h(
-        'form',
-        { class: 'card new-job', 'aria-label': 'New job' },
-        dataset.element,
+    const settings = h(
+        'div',
+        { class: 'new-job-settings', hidden: true },
         name.element,
         h('div', { class: 'pairs' }, partitions.row.element, preset.element, iterations.element, maxGaussians.element, priority.element),
         h('div', { class: 'check' }, previews, h('label', { for: previews.id }, 'Small pictures of held-out views while it trains')),
@@ -160,19 +258,38 @@ function makeForm(context: Context): { readonly element: HTMLElement; offer(data
         alert,
         h('div', { class: 'row end' }, h('a', { class: 'button', href: jobsLink() }, 'Back'), create),
     );
+    const scene = h(
+        'fieldset',
+        { class: 'scene-source' },
+        h('legend', {}, 'Scene'),
+        kinds,
+        dataset.element,
+        folder.element,
+        check.element,
+    );
+    const element = h('form', { class: 'card new-job', 'aria-label': 'New job' }, scene, settings);
     element.addEventListener('submit', (event) => {
         event.preventDefault();
         void send();
     });
+    for (const kind of ['input', 'change']) {
+        settings.addEventListener(kind, () => check.compare());
+    }
     let offered = '';
     return {
         element,
+        isUsed: () => folder.hasFolder,
         offer: (datasets, wanted) => {
-            const key = JSON.stringify(datasets.map(({ datasetId }) => datasetId));
-            if (key === offered) {
+            const key = JSON.stringify(datasets.map(({ datasetId: id }) => id));
+            if (key === offered || datasets.length === 0) {
                 return;
             }
+            if (offered === '' && !folder.hasFolder) {
+                choose('dataset');
+            }
             offered = key;
+            kinds.hidden = false;
+            settings.hidden = false;
             const chosen = datasetSelect.value === '' ? wanted : datasetSelect.value;
             datasetSelect.replaceChildren(
                 ...datasets.map((one) => h('option', { value: one.datasetId, selected: one.datasetId === chosen }, optionText(one))),
@@ -184,8 +301,15 @@ function makeForm(context: Context): { readonly element: HTMLElement; offer(data
 export function showNewJob(container: HTMLElement, context: Context, wanted: string): void {
     const { signal } = context;
     context.title('New job');
-    const form = makeForm(context);
-    const content = h('div', {}, h('p', { class: 'card loading', role: 'status' }, 'Loading the datasets …'));
+    const form = makeForm(context, () => {
+        none.hidden = true;
+        polling.now();
+    });
+    const loading = h('p', { class: 'card loading', role: 'status' }, 'Loading the datasets …');
+    const ways = howToUpload(context, 'Drop a folder above, or upload one from a terminal:');
+    const none = h('div', { class: 'card flush', hidden: true }, ways);
+    const problem = h('div', { class: 'card flush', hidden: true });
+    const content = h('div', { class: 'new-job-page' }, loading);
     container.append(
         h(
             'div',
@@ -196,29 +320,25 @@ export function showNewJob(container: HTMLElement, context: Context, wanted: str
         content,
     );
     let hasDatasets = false;
-    let shown: HTMLElement | null = null;
-    const place = (element: HTMLElement): void => {
-        if (shown !== element) {
-            shown = element;
-            content.replaceChildren(element);
-        }
-    };
-    const none = h('div', { class: 'card flush' }, howToUpload(context));
-    poll(() => (hasDatasets ? SELDOM_MS : SOON_MS), signal, async () => {
+    const polling = poll(() => (hasDatasets ? SELDOM_MS : SOON_MS), signal, async () => {
         try {
             const datasets = (await listDatasets(context)).filter(isCommitted);
             // A form that somebody fills in stays.
             hasDatasets ||= datasets.length > 0;
-            if (hasDatasets) {
-                form.offer(datasets, wanted);
-                place(form.element);
-            } else {
-                place(none);
+            if (!form.element.isConnected) {
+                content.replaceChildren(form.element, problem, none);
             }
+            none.hidden = hasDatasets || form.isUsed();
+            problem.hidden = true;
+            form.offer(datasets, wanted);
         } catch (error) {
-            const problem = problemOf('The datasets cannot be listed', faultOf(error));
-            if (problem !== null && !hasDatasets) {
-                place(problem);
+            const shown = problemOf('The datasets cannot be listed', faultOf(error));
+            if (shown !== null && !hasDatasets) {
+                problem.replaceChildren(shown);
+                problem.hidden = false;
+                if (!form.element.isConnected) {
+                    content.replaceChildren(problem);
+                }
             }
         }
     });

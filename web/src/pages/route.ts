@@ -1,7 +1,17 @@
 // The addresses of the pages. They are in the fragment, so the server sees neither them nor a token in a
 // link.
 
-export const JOB_SECTIONS = ['overview', 'curves', 'views', 'water', 'log', 'files', 'settings', 'viewer'] as const;
+export const JOB_SECTIONS = [
+    'overview',
+    'curves',
+    'views',
+    'water',
+    'seams',
+    'log',
+    'files',
+    'settings',
+    'viewer',
+] as const;
 export type JobSection = (typeof JOB_SECTIONS)[number];
 export const SERVICE_SECTIONS = ['workers', 'queue', 'tenants', 'tokens'] as const;
 export type ServiceSection = (typeof SERVICE_SECTIONS)[number];

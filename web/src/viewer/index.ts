@@ -18,6 +18,7 @@ import { Sorter } from './sorter.ts';
 import { savePicture } from './still.ts';
 import { type Quat, type Vec3, quatInverse, rotate } from './vector.ts';
 import { Viewer } from './viewer.ts';
+import type { WaterRecord } from './water.ts';
 import './viewer.css';
 
 export type { CameraEntry, FetchFile, Plan, Scene } from './scene.ts';
@@ -63,6 +64,11 @@ export interface ViewerHandle {
     measure(count: number): Promise<{ frame: number[]; sort: number[] }>;
     /** Number of Gaussians. */
     readonly gaussians: number;
+    /**
+     * Shows another model of the same scene; the camera, and what is shown, stay. Rejects with a
+     * `ViewerError`, and then the model before stays too.
+     */
+    replaceModel(path: string): Promise<void>;
     /** Removes the viewer and frees its memory. */
     destroy(): void;
 }
@@ -71,6 +77,16 @@ declare global {
     interface HTMLElement {
         fathomViewer?: ViewerHandle;
     }
+}
+
+/** A model that the renderer has. */
+interface LoadedModel {
+    /** Model axes. */
+    readonly centres: Float32Array;
+    /** Scene axes. */
+    readonly inScene: Float32Array;
+    readonly water: WaterRecord | null;
+    readonly comments: readonly string[];
 }
 
 const viewOf = (camera: CameraEntry): View => ({
@@ -145,39 +161,54 @@ async function open(
             viewer?.redraw();
         },
     );
-    const bytes = await download(scene.model, fetchFile, (done, total) => {
-        progress.textContent = total > 0 ? `${megabytes(done)} of ${megabytes(total)} MB` : `${megabytes(done)} MB`;
-        if (total > 0) {
-            bar.value = done / total;
-        }
-    });
-    progress.textContent = 'Preparing the model';
-    bar.removeAttribute('value');
-    // Lets the browser show the text before it is busy.
-    await new Promise((done) => setTimeout(done, 0));
-
-    const header = isPly(bytes) ? readHeader(bytes, scene.model) : null;
-    if (header === null && !/\.sog$/i.test(scene.model)) {
-        throw new ViewerError(
-            `${scene.model} is not a model that can be read.`,
-            'Use a .ply of 3D Gaussians, a .compressed.ply or a .sog.',
-        );
-    }
-    const kind = header === null ? 'sog' : 'ply';
-    const comments = header?.comments ?? [];
-    const toModel: Quat = frameAmong(comments) ?? [0, 0, 0, 1];
-    const response = new Response(bytes as Uint8Array<ArrayBuffer>);
-    const centres = await renderer.load(response, scene.model, kind, isAntialiased(comments), toModel);
-    const water = scene.water ?? waterAmong(comments);
-    renderer.setWater(water);
-    const inScene = turnedCentres(centres, quatInverse(toModel));
     const hasPartitions = scene.plan !== null && scene.plan.partitions.length > 1;
-    if (scene.plan !== null && hasPartitions) {
-        renderer.setPartitions(partitionsOf(scene.plan, inScene));
-    }
+    /** Fetches a model and gives it to the renderer. */
+    const loadModel = async (
+        path: string,
+        onProgress: (done: number, total: number) => void,
+        onFetched: () => Promise<void>,
+    ): Promise<LoadedModel> => {
+        const bytes = await download(path, fetchFile, onProgress);
+        await onFetched();
+        const header = isPly(bytes) ? readHeader(bytes, path) : null;
+        if (header === null && !/\.sog$/i.test(path)) {
+            throw new ViewerError(
+                `${path} is not a model that can be read.`,
+                'Use a .ply of 3D Gaussians, a .compressed.ply or a .sog.',
+            );
+        }
+        const kind = header === null ? 'sog' : 'ply';
+        const comments = header?.comments ?? [];
+        const toModel: Quat = frameAmong(comments) ?? [0, 0, 0, 1];
+        const response = new Response(bytes as Uint8Array<ArrayBuffer>);
+        const centres = await renderer.load(response, path, kind, isAntialiased(comments), toModel);
+        const water = scene.water ?? waterAmong(comments);
+        renderer.setWater(water);
+        const inScene = turnedCentres(centres, quatInverse(toModel));
+        if (scene.plan !== null && hasPartitions) {
+            renderer.setPartitions(partitionsOf(scene.plan, inScene));
+        }
+        return { centres, inScene, water, comments };
+    };
+    const { centres, inScene, water, comments } = await loadModel(
+        scene.model,
+        (done, total) => {
+            const ofTotal = total > 0 ? ` of ${megabytes(total)}` : '';
+            progress.textContent = `${megabytes(done)}${ofTotal} MB`;
+            if (total > 0) {
+                bar.value = done / total;
+            }
+        },
+        async () => {
+            progress.textContent = 'Preparing the model';
+            bar.removeAttribute('value');
+            // Lets the browser show the text before it is busy.
+            await new Promise((done) => setTimeout(done, 0));
+        },
+    );
     const sorter = new Sorter(centres);
     viewer = new Viewer(scene, water, canvas, renderer, sorter, inScene, hasPartitions);
-    const gaussians = centres.length / 3;
+    let gaussians = centres.length / 3;
     const opened = viewer;
     const begin = readFragment(options.views ?? '');
     opened.bookmarks = begin.bookmarks;
@@ -220,7 +251,19 @@ async function open(
     }
 
     const handle: ViewerHandle = {
-        gaussians,
+        get gaussians() {
+            return gaussians;
+        },
+        replaceModel: async (path) => {
+            try {
+                const next = await loadModel(path, () => {}, async () => {});
+                opened.replace(new Sorter(next.centres), next.water);
+                gaussians = next.centres.length / 3;
+            } catch (thrown) {
+                throw explained(thrown);
+            }
+            await opened.settled();
+        },
         setCamera: (camera) => {
             const { pose, lens } = viewOf(camera);
             const isKnown = opened.cameras.some(({ img_name }) => img_name === camera.img_name);

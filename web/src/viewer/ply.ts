@@ -7,7 +7,12 @@ import { type WaterRecord, checkWater } from './water.ts';
 export interface PlyHeader {
     readonly comments: readonly string[];
     /** Elements in the order of the file. */
-    readonly elements: readonly { readonly name: string; readonly count: number; readonly rowBytes: number }[];
+    readonly elements: readonly {
+        readonly name: string;
+        readonly count: number;
+        readonly rowBytes: number;
+        readonly properties: readonly string[];
+    }[];
     /** Bytes up to the first row. */
     readonly bytes: number;
 }

@@ -104,6 +104,10 @@ class DrawPass extends RenderPass {
 
 /** A model on the device. */
 interface Model {
+    /** The file that the engine holds. */
+    readonly asset: Asset;
+    /** From scene axes to those of the model. */
+    readonly toModel: Quat;
     readonly resource: GSplatResourceBase;
     /** Parameters of the file format: textures and numbers. */
     readonly material: ShaderMaterial;
@@ -143,8 +147,10 @@ export class Renderer {
     readonly #rangeFormat: number;
     #targets: RenderTarget | null = null;
     #model: Model | null = null;
+    /** A model that was loaded and replaces the other one once it is sorted. */
+    #next: Model | null = null;
+    #loadedModels = 0;
     #water: WaterRecord | null = null;
-    #toModel: Quat = [0, 0, 0, 1];
 
     constructor(canvas: HTMLCanvasElement, onLost: () => void, onRestored: () => void) {
         this.#canvas = canvas;
@@ -200,8 +206,8 @@ export class Renderer {
     }
 
     /**
-     * Reads a model. `toModel` turns scene axes into those of the model. Returns the centres of the Gaussians,
-     * model axes.
+     * Reads a model, which replaces one before it with the next order of its Gaussians. `toModel` turns scene
+     * axes into those of the model. Returns the centres of the Gaussians, model axes.
      */
     async load(
         response: Response,
@@ -210,18 +216,20 @@ export class Renderer {
         antialiased: boolean,
         toModel: Quat,
     ): Promise<Float32Array> {
-        const resource = await this.#parse(response, name, kind);
+        const asset = await this.#parse(response, name, kind);
+        const resource = asset.resource as unknown as GSplatResourceBase;
         const centres = resource.centers;
         if (!centres) {
             throw new ViewerError(`${name} holds no positions.`, 'Download the model again.');
         }
-        this.#toModel = toModel;
         const material = new ShaderMaterial({ uniqueName: 'FathomFormat', vertexGLSL: '', fragmentGLSL: '' } as never);
         resource.configureMaterial(material, null, resource.format.getInputDeclarations());
         const { shBands } = resource.gsplatData as { readonly shBands?: number };
         const width = Math.min(2048, this.#device.maxTextureSize);
         const height = Math.ceil(resource.numSplats / width);
-        this.#model = {
+        this.#next = {
+            asset,
+            toModel,
             resource,
             material,
             shader: this.#splatShader(material, false),
@@ -242,11 +250,17 @@ export class Renderer {
     /** The number of the partition of each Gaussian, in the order of the centres. */
     setPartitions(numbers: Uint8Array): void {
         const model = this.#loaded();
+        model.partitions?.destroy();
         const { x: width, y: height } = model.resource.textureDimensions;
         const partitions = this.#texture('partitions', PIXELFORMAT_R8U, width, height);
         (partitions.lock() as Uint8Array).set(numbers);
         partitions.unlock();
-        this.#model = { ...model, partitions, shader: this.#splatShader(model.material, true) };
+        const changed = { ...model, partitions, shader: this.#splatShader(model.material, true) };
+        if (this.#next === null) {
+            this.#model = changed;
+        } else {
+            this.#next = changed;
+        }
     }
 
     setOrder(sorted: Sorted): void {
@@ -254,6 +268,10 @@ export class Renderer {
         (model.order.lock() as Uint32Array).set(sorted.order.subarray(0, sorted.count));
         model.order.unlock();
         model.count = sorted.count;
+        if (this.#next !== null) {
+            this.#free(this.#model);
+            [this.#model, this.#next] = [this.#next, null];
+        }
     }
 
     /** Draws a frame to the canvas. `area` is the rectangle of the picture, pixels from the lower left. */
@@ -319,24 +337,39 @@ export class Renderer {
         this.#app.destroy();
     }
 
+    /** The model that was loaded last. */
     #loaded(): Model {
-        if (this.#model === null) {
+        const model = this.#next ?? this.#model;
+        if (model === null) {
             throw new Error('no model is loaded');
         }
-        return this.#model;
+        return model;
     }
 
-    #parse(response: Response, name: string, kind: 'ply' | 'sog'): Promise<GSplatResourceBase> {
+    #free(model: Model | null): void {
+        if (model !== null) {
+            this.#app.assets.remove(model.asset);
+            // This frees what the engine made of the file.
+            model.asset.unload();
+            model.order.destroy();
+            model.partitions?.destroy();
+        }
+    }
+
+    #parse(response: Response, name: string, kind: 'ply' | 'sog'): Promise<Asset> {
+        // Of two files at one address the engine would read only the first.
+        this.#loadedModels += 1;
+        const file = `model-${this.#loadedModels}.${kind}`;
         // The engine picks a reader by the ending of the address, and fetches nothing when it has contents.
         const asset = new Asset(
             name,
             'gsplat',
-            { url: `model.${kind}`, filename: `model.${kind}`, contents: response } as never,
+            { url: file, filename: file, contents: response } as never,
             // The order of the rows is kept: Fathom's rows are already close to their neighbours.
             { reorder: false } as never,
         );
         return new Promise((resolve, reject) => {
-            asset.on('load', () => resolve(asset.resource as unknown as GSplatResourceBase));
+            asset.on('load', () => resolve(asset));
             asset.on('error', (why: unknown) =>
                 reject(
                     new ViewerError(
@@ -444,7 +477,7 @@ export class Renderer {
             return;
         }
         const { camera } = frame;
-        const pose = this.#inModel(frame.pose);
+        const pose = inModel(model, frame.pose);
         const { rotation, translation } = worldToCamera(pose);
         const rows = ['uViewX', 'uViewY', 'uViewZ'];
         rows.forEach((name, i) => this.#set(name, [...rotation[i as 0 | 1 | 2], translation[i as 0 | 1 | 2]]));
@@ -529,19 +562,17 @@ export class Renderer {
         }
     }
 
-    /** The pose in the axes of the model. */
-    #inModel(pose: Pose): Pose {
-        return {
-            position: rotate(this.#toModel, pose.position),
-            rotation: quatMul(this.#toModel, pose.rotation),
-        };
-    }
-
-    /** A pose for the sorter, whose centres are in model axes. */
+    /** A pose for the sorter, whose centres are in the axes of the model that was loaded last. */
     poseForSorting(pose: Pose): Pose {
-        return this.#inModel(pose);
+        return inModel(this.#loaded(), pose);
     }
 }
+
+/** A pose in the axes of a model. */
+const inModel = ({ toModel }: Model, pose: Pose): Pose => ({
+    position: rotate(toModel, pose.position),
+    rotation: quatMul(toModel, pose.rotation),
+});
 
 function quads(device: WebglGraphicsDevice): Mesh {
     const positions: number[] = [];

@@ -75,7 +75,7 @@ function extentOf(centres: Float32Array): { middle: Vec3; size: number } {
 export class Viewer {
     readonly scene: Scene;
     readonly cameras: readonly CameraEntry[];
-    readonly water: WaterRecord | null;
+    water: WaterRecord | null;
     readonly up: Vec3;
     readonly hasPartitions: boolean;
     readonly canvas: HTMLCanvasElement;
@@ -91,7 +91,7 @@ export class Viewer {
     onFrame: () => void = () => {};
 
     readonly #renderer: Renderer;
-    readonly #sorter: Sorter;
+    #sorter: Sorter;
     readonly #input: Input;
     readonly #resized: ResizeObserver;
     /** Length of a second of movement, scene units. */
@@ -316,6 +316,16 @@ export class Viewer {
             frame.push(performance.now() - started);
         }
         return { frame, sort };
+    }
+
+    /** Shows another model, which the renderer has loaded. The camera and what is shown stay. */
+    replace(sorter: Sorter, water: WaterRecord | null): void {
+        this.#sorter.destroy();
+        this.#sorter = sorter;
+        this.water = water;
+        this.#sorted = null;
+        this.#sorting = null;
+        this.redraw();
     }
 
     destroy(): void {

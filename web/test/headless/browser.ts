@@ -5,6 +5,10 @@ import { type Browser, type BrowserContextOptions, type Page, chromium } from 'p
 
 const PATHS = ['/usr/bin/chromium-headless-shell', '/usr/bin/chromium', '/usr/bin/google-chrome'];
 const FLAGS = ['--no-sandbox', '--use-angle=swiftshader', '--enable-unsafe-swiftshader', '--ignore-gpu-blocklist'];
+/** The window of a page, pixels. */
+export const WINDOW = { width: 1000, height: 700 };
+/** For tests that ask the viewer for pictures of their own: after each it draws its window again. */
+export const SMALL_WINDOW = { width: 660, height: 160 };
 
 export function browserPath(): string | null {
     return process.env['CHROMIUM'] || (PATHS.find((path) => existsSync(path)) ?? null);
@@ -23,7 +27,7 @@ export async function newPage(
     browser: Browser,
     options: BrowserContextOptions = {},
 ): Promise<{ page: Page; complaints: string[] }> {
-    const context = await browser.newContext({ viewport: { width: 1000, height: 700 }, ...options });
+    const context = await browser.newContext({ viewport: WINDOW, ...options });
     const page = await context.newPage();
     const complaints: string[] = [];
     page.on('console', (message) => {

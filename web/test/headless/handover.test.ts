@@ -11,7 +11,7 @@ import { pathToFileURL } from 'node:url';
 import type { Browser, Page } from 'playwright-core';
 
 import type { CameraEntry, Mode } from '../../src/viewer/index.ts';
-import { launch, newPage } from './browser.ts';
+import { SMALL_WINDOW, WINDOW, launch, newPage } from './browser.ts';
 import { type Picture, decodePng, psnr, readPng } from './pictures.ts';
 import { serve } from './server.ts';
 
@@ -82,7 +82,7 @@ test('a compressed copy shows what the model shows, with the water in its header
         'scene.json': Buffer.from(JSON.stringify(scene)),
         'model.compressed.ply': COPY,
     }));
-    const { page, complaints } = await newPage(browser);
+    const { page, complaints } = await newPage(browser, { viewport: SMALL_WINDOW });
     await page.goto(`${serving.address}/copy/view.html`);
     await waitForViewer(page);
     await compare(page, 'compressed copy', GOAL);
@@ -92,7 +92,7 @@ test('a compressed copy shows what the model shows, with the water in its header
 });
 
 test('the page opens from the disk without a network and shows the model', TIMEOUT, async () => {
-    const { page, complaints } = await newPage(browser);
+    const { page, complaints } = await newPage(browser, { viewport: SMALL_WINDOW });
     await page.context().setOffline(true);
     const requests: string[] = [];
     page.on('request', (request) => requests.push(request.url()));
@@ -100,6 +100,7 @@ test('the page opens from the disk without a network and shows the model', TIMEO
     await page.goto(address);
     await waitForViewer(page);
     await compare(page, 'page', GOAL);
+    await page.setViewportSize(WINDOW);
 
     // Nothing that was put in is markup.
     assert.equal(await page.title(), '<script>wreck & co - Fathom');

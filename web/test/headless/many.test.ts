@@ -7,7 +7,7 @@ import type { AddressInfo } from 'node:net';
 import { join } from 'node:path';
 import { after, before, test } from 'node:test';
 
-import { type DescMessage, type MessageInitShape, create, fromBinary, toBinary } from '@bufbuild/protobuf';
+import { fromBinary } from '@bufbuild/protobuf';
 import { timestampFromMs } from '@bufbuild/protobuf/wkt';
 import type { Browser, Page } from 'playwright-core';
 import { PNG } from 'pngjs';
@@ -17,6 +17,7 @@ import { GetHistoryRequestSchema, HistorySchema, JobEventSchema, JobSchema, JobS
 import { LogEntrySchema, LogSeverity } from '../../src/rpc/fathom/v1/log_pb.ts';
 import { ReadBlobResponseSchema } from '../../src/rpc/fathom/v1/upload_pb.ts';
 import { launch, newPage } from './browser.ts';
+import { TRAILER, framed, messageOf } from './grpc-web.ts';
 import { serveWith } from './service.ts';
 
 const PAGES = process.env['PAGES'] ?? join(import.meta.dirname, '../../dist');
@@ -31,21 +32,6 @@ const FIRST_PAINT_MS = 1000;
 const STEP_MS = 200;
 /** The quickest of so many counts, since other programs may use the processor too. */
 const TRIES = 4;
-
-/** A message of gRPC-Web. */
-function framed<D extends DescMessage>(schema: D, content: MessageInitShape<D>): Buffer {
-    const body = toBinary(schema, create(schema, content));
-    const head = Buffer.alloc(5);
-    head.writeUInt32BE(body.length, 1);
-    return Buffer.concat([head, body]);
-}
-const TRAILER = ((): Buffer => {
-    const text = Buffer.from('grpc-status:0\r\n');
-    const head = Buffer.alloc(5);
-    head.writeUInt8(0x80, 0);
-    head.writeUInt32BE(text.length, 1);
-    return Buffer.concat([head, text]);
-})();
 
 /** Jobs whose histories were asked for. */
 const historiesAsked: string[] = [];
@@ -71,7 +57,7 @@ const jobOf = (index: number) => ({
 const ANSWERS: Readonly<Record<string, (asked: Buffer) => readonly Buffer[]>> = {
     GetCaller: () => [framed(CallerSchema, { name: 'ops', role: Role.OPERATOR, tokensRequired: true })],
     ListJobs: (asked) => {
-        const { pageSize, pageToken } = fromBinary(ListJobsRequestSchema, asked.subarray(5));
+        const { pageSize, pageToken } = fromBinary(ListJobsRequestSchema, messageOf(asked));
         const [first, end] = [Number(pageToken), Number(pageToken) + pageSize];
         const jobs = Array.from({ length: JOBS }, (_, index) => jobOf(index)).slice(first, end);
         return [framed(ListJobsResponseSchema, { jobs, nextPageToken: end < JOBS ? String(end) : '' })];
@@ -90,7 +76,7 @@ const ANSWERS: Readonly<Record<string, (asked: Buffer) => readonly Buffer[]>> = 
         }),
     ],
     GetHistory: (asked) => {
-        const { jobId } = fromBinary(GetHistoryRequestSchema, asked.subarray(5));
+        const { jobId } = fromBinary(GetHistoryRequestSchema, messageOf(asked));
         historiesAsked.push(jobId);
         const render = { digest: jobId.slice(-1).repeat(64), sizeBytes: 1n };
         return [framed(HistorySchema, { tasks: [{ taskId: taskOf(0), previews: [{ view: 'a.jpg', iteration: 1, render }] }] })];

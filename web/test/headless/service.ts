@@ -51,7 +51,7 @@ export interface JobJson {
     readonly error: string | null;
     readonly waiting_reason: string | null;
     readonly partitions: number;
-    readonly tasks: readonly { readonly task: string; readonly state: string }[];
+    readonly tasks: readonly { readonly task: string; readonly state: string; readonly attempts: number }[];
 }
 
 /** A coordinator that can be killed and started again, and its workers. */
@@ -131,7 +131,9 @@ export class Service {
     /** What the JSON interface says. */
     async api<T>(token: string, path: string): Promise<T> {
         const headers = { authorization: `Bearer ${token}` };
-        const response = await fetch(`http://127.0.0.1:${this.webPort}/api/v1/${path}`, { headers });
+        const ask = (): Promise<Response> => fetch(`http://127.0.0.1:${this.webPort}/api/v1/${path}`, { headers });
+        // A connection that `fetch` kept may have been closed by the other side at this moment.
+        const response = await ask().catch(ask);
         return (await response.json()) as T;
     }
 

@@ -9,7 +9,11 @@ import { after, before, test } from 'node:test';
 import type { Browser, Page } from 'playwright-core';
 
 import type { CameraEntry, Mode, Scene } from '../../src/viewer/index.ts';
-import { launch, newPage } from './browser.ts';
+import { pinholeOf, poseOf, resized } from '../../src/viewer/camera.ts';
+import { rotate, unit } from '../../src/viewer/vector.ts';
+import { type WaterRecord, openWater } from '../../src/viewer/water.ts';
+import { SMALL_WINDOW, launch, newPage } from './browser.ts';
+import { fitWater, readNpy } from './fit-water.ts';
 import { type Picture, cropped, decodePng, psnr, readPng } from './pictures.ts';
 import { type Serving, serve } from './server.ts';
 
@@ -126,7 +130,7 @@ const needs = (name: string): { timeout: number; skip: string | false } => ({
 
 for (const name of MODELS) {
     test(`the pictures of "${name}" are those of fathom render`, needs(name), async () => {
-        const { page, complaints } = await open(name);
+        const { page, complaints } = await open(name, { viewport: SMALL_WINDOW });
         for (const [mode, goal] of Object.entries(GOALS)) {
             const folder = mode === 'alpha' || mode === 'normal' ? `clear/${mode}` : mode;
             const pictures = camerasOf(name)
@@ -144,6 +148,45 @@ for (const name of MODELS) {
                 assert.ok(least >= goal, `${name} ${mode}: ${least} dB, expected ${goal}`);
             }
         }
+        assert.deepEqual(complaints, []);
+        await page.context().close();
+    });
+}
+
+for (const name of ['pixel', 'open'] as const) {
+    test(`water fitted back from the screen is that of "${name}"`, needs(name), async (t) => {
+        const [camera] = camerasOf(name);
+        const { page, complaints } = await open(name, { viewport: { width: 904, height: 450 } });
+        const shownAs = async (mode: Mode): Promise<Picture> => {
+            await page.evaluate(
+                ({ entry, left }) => {
+                    const viewer = document.querySelector<HTMLElement>('#viewer')!.fathomViewer!;
+                    viewer.setCamera(entry);
+                    viewer.setModes(left, 'none');
+                },
+                { entry: camera!, left: mode },
+            );
+            return screen(page);
+        };
+        const [clear, water] = [await shownAs('clear'), await shownAs('water')];
+        const [folder, file] = [join(DATA, 'renders', name, 'ranges'), camera!.img_name.replace(/\.[^.]+$/, '')];
+        const range = readNpy(join(folder, `range/${file}.npy`));
+        const trained = read<WaterRecord>(join(DATA, name, 'water.json'));
+        // The change of open water with direction is taken as known, and its colour in the middle is fitted.
+        const { pose, lens } = { pose: poseOf(camera!), lens: resized(pinholeOf(camera!), clear.width, clear.height) };
+        const openAt = (x: number, y: number): number[] => {
+            const ray = rotate(pose.rotation, unit([(x + 0.5 - lens.cx) / lens.fx, (y + 0.5 - lens.cy) / lens.fy, 1]));
+            return openWater(trained, ray).map((value, i) => value / trained.b_inf[i as 0 | 1 | 2]);
+        };
+        const fitted = fitWater(clear, water, readPng(join(folder, `alpha/${file}.png`)), range, openAt);
+        fitted.forEach(({ beta_d, beta_b, b_inf, pixels, left }, i) => {
+            const d = beta_d / trained.beta_d[i as 0 | 1 | 2] - 1;
+            const b = beta_b / trained.beta_b[i as 0 | 1 | 2] - 1;
+            const infinity = b_inf - trained.b_inf[i as 0 | 1 | 2];
+            const apart = `beta_d ${(100 * d).toFixed(2)} %, beta_b ${(100 * b).toFixed(2)} %, b_inf ${infinity.toFixed(5)}`;
+            t.diagnostic(`channel ${i}: ${apart}; ${pixels} pixels, ${left.toFixed(2)} of 255 left`);
+            assert.ok(Math.abs(d) < 0.02 && Math.abs(b) < 0.02 && Math.abs(infinity) < 0.002, `channel ${i}: ${apart}`);
+        });
         assert.deepEqual(complaints, []);
         await page.context().close();
     });
@@ -207,7 +250,7 @@ test('a photograph is compared with the render of its own camera', TIMEOUT, asyn
 });
 
 test('no water is left at 0 times the usual distance, and more at 10', TIMEOUT, async () => {
-    const { page } = await open('gaussian');
+    const { page } = await open('gaussian', { viewport: SMALL_WINDOW });
     const [camera] = camerasOf('gaussian');
     const size = { width: 200, height: 150, data: new Uint8Array() };
     const at = async (amount: number, mode: Mode): Promise<Picture> => {

@@ -7,7 +7,7 @@ import { create } from '@bufbuild/protobuf';
 import { Code, ConnectError } from '@connectrpc/connect';
 
 import { faultOf, wrongFieldsOf } from '../../src/pages/faults.ts';
-import { firstSeries, frameAt, newestFrame, seriesOf } from '../../src/pages/job/preview-series.ts';
+import { digestsOf, firstSeries, frameAt, newestFrame, seriesOf } from '../../src/pages/job/preview-series.ts';
 import { type JobForm, WrongForm, configOf, freshUuid, wrongField } from '../../src/pages/job-settings.ts';
 import { picturesIn } from '../../src/pages/thumbnails.ts';
 import { type TaskHistory, TaskHistorySchema } from '../../src/rpc/fathom/v1/job_pb.ts';
@@ -131,6 +131,15 @@ test('previews are grouped by task and view, and by iteration', () => {
 test('a preview without a picture is left out', () => {
     const task = create(TaskHistorySchema, { taskId: 'global', previews: [{ view: 'a', iteration: 1 }] });
     assert.deepEqual(seriesOf([task]), []);
+    assert.deepEqual([...digestsOf([task])], []);
+});
+
+test('pictures that are named are those with and without water', () => {
+    const task = create(TaskHistorySchema, {
+        taskId: 'global',
+        previews: [{ view: 'a', iteration: 1, render: blob('render'), clear: blob('clear') }],
+    });
+    assert.deepEqual([...digestsOf([history('global', ['a', 5]), task])], ['global a 5', 'render', 'clear']);
 });
 
 test('a row of pictures has two more of them in water', () => {

@@ -16,7 +16,7 @@ use fathom_core::train::{
     surface_points, with_ray_maps,
 };
 use fathom_core::views::ViewSource;
-use fathom_core::water::WaterRecord;
+use fathom_core::water::{Water, WaterRecord};
 use fathom_proto::v1::{self, Progress};
 use fathom_proto::worker::v1::CommonSpec;
 
@@ -213,6 +213,8 @@ pub fn advance(
     let eval_every = if held_out.views().is_empty() { 0 } else { config.eval_every };
     let mut history: Vec<v1::HeldOutMetrics> = Vec::new();
     let mut stretch = FIRST_STRETCH;
+    let (mut training, mut watching) = (Duration::ZERO, Duration::ZERO);
+    let waited_before = run.waited_for_photographs();
     while run.progress().iteration < span.until {
         match control.stop_reason() {
             None => {}
@@ -227,8 +229,11 @@ pub fn advance(
         let until_first = cadence.until_first(before.saturating_sub(span.from), span.length());
         let next = stretch.min(until_measured(before, eval_every)).min(until_first).min(span.until - before);
         let progress = run.advance(next)?;
-        let took = started.elapsed().as_secs_f32().max(1e-6);
-        let iterations_per_second = (progress.iteration - before) as f32 / took;
+        let took = started.elapsed();
+        training += took;
+        let iterations_per_second = (progress.iteration - before) as f32 / took.as_secs_f32().max(1e-6);
+        let photographs = run.waited_for_photographs().saturating_sub(waited_before);
+        let watched = Instant::now();
         let mut report = Progress {
             iteration: span.done(progress.iteration),
             iterations: span.counted,
@@ -236,6 +241,13 @@ pub fn advance(
             loss: progress.loss,
             iterations_per_second,
             held_out: history.last().copied(),
+            water: run.water()?.map(water_now),
+            time_spent: Some(v1::TimeSpent {
+                training_seconds: training.saturating_sub(photographs).as_secs_f32(),
+                photographs_seconds: photographs.as_secs_f32(),
+                watching_seconds: watching.as_secs_f32(),
+                ..v1::TimeSpent::default()
+            }),
             ..Progress::default()
         };
         control.report(report);
@@ -257,8 +269,17 @@ pub fn advance(
             control.checkpoint(Bytes::from(run.checkpoint()?), span.done(progress.iteration));
             cadence.taken();
         }
+        watching += watched.elapsed();
     }
     Ok(history)
+}
+
+fn water_now(water: Water) -> v1::WaterNow {
+    let rgb = |of: [f64; 3]| {
+        let [red, green, blue] = of.map(|value| value as f32);
+        Some(v1::Rgb { red, green, blue })
+    };
+    v1::WaterNow { beta_d: rgb(water.beta_d), beta_b: rgb(water.beta_b), b_inf: rgb(water.b_inf) }
 }
 
 /// Iterations from `iteration` to the next measurement, one every `every`; 0: never.

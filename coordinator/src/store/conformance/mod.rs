@@ -43,6 +43,7 @@ fn blob(name: &str) -> BlobRef {
 
 fn new_job(number: u32) -> NewJob {
     NewJob {
+        announce: false,
         job_id: JobId::new(T0 + u64::from(number), number),
         request_id: format!("request-{number}"),
         name: format!("job {number}"),
@@ -450,6 +451,7 @@ conformance!(
     a_paused_job_assigns_nothing_and_accepts_results,
     the_duration_of_a_stage_excludes_pauses,
     a_retried_job_resumes_where_it_failed,
+    the_end_of_a_job_is_announced_by_one_coordinator_once,
     a_deleted_job_is_gone_and_its_request_makes_no_other,
     the_job_with_higher_priority_goes_first_within_limits,
     a_list_has_all_jobs_of_its_filter_page_by_page,

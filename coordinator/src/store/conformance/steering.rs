@@ -208,3 +208,29 @@ pub async fn a_list_has_all_jobs_of_its_filter_page_by_page(store: Arc<dyn Store
         [18, 16, 14, 12, 10].into_iter().map(|number: usize| ids[number].clone()).collect();
     assert_eq!(found, wanted);
 }
+
+pub async fn the_end_of_a_job_is_announced_by_one_coordinator_once(store: Arc<dyn Store>) {
+    let store = store.as_ref();
+    let id = store.submit(NewJob { announce: true, ..new_job(1) }, T0).await.unwrap().job_id;
+    let silent = store.submit(new_job(2), T0).await.unwrap().job_id;
+    let apply = async |id: &JobId, event| store.apply(id, event, T0 + 30).await.unwrap();
+    let announce = |ended_ms, known_ms, until_ms| Event::Announce { ended_ms, known_ms, until_ms };
+    let row = async |id: &JobId| store.job_row(id).await.unwrap().announcement;
+    assert!(matches!(apply(&id, announce(T0, 0, T0)).await, Outcome::Already), "it has not ended");
+    let lease = claim(store, &[Stage::Plan], T0 + 5).await.unwrap().lease;
+    store.fail(&lease, FailClass::Input, "no points".into(), T0 + 20).await.unwrap();
+    cancel(store, &silent, "enough", T0 + 20).await.unwrap();
+    assert!(matches!(apply(&silent, announce(T0 + 20, 0, T0)).await, Outcome::Already), "nobody wants it");
+
+    assert!(matches!(apply(&id, announce(T0 + 20, 0, T0 + 90)).await, Outcome::Changed(_)));
+    assert!(matches!(apply(&id, announce(T0 + 20, 0, T0 + 99)).await, Outcome::Already), "two are at it");
+    assert_eq!(row(&id).await, Announcement::Due { not_before_ms: T0 + 90 });
+    // It was retried before the webhook took it, and ended again: the first end is of no interest.
+    store.steer(&id, Event::Retry, T0 + 31).await.unwrap();
+    cancel(store, &id, "enough", T0 + 40).await.unwrap();
+    assert!(matches!(apply(&id, Event::Announced { ended_ms: T0 + 20 }).await, Outcome::Already));
+    assert!(matches!(apply(&id, Event::Announced { ended_ms: T0 + 40 }).await, Outcome::Changed(_)));
+    assert!(matches!(apply(&id, Event::Announced { ended_ms: T0 + 40 }).await, Outcome::Already));
+    assert_eq!(row(&id).await, Announcement::Made);
+    assert_eq!(verify::faults(&store.export().await.unwrap()), Vec::<String>::new());
+}

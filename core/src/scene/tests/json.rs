@@ -4,7 +4,8 @@ use glam::DVec3;
 use serde_json::{Value, json};
 
 use super::fixture::{Dataset, HEIGHT, Model, WIDTH, assert_says, write_png};
-use crate::scene::{CameraModel, Purpose, Scene};
+use crate::config::DataConfig;
+use crate::scene::{CameraModel, Purpose, Scene, load_foreign_scene};
 
 /// A camera at (1, 2, 3) that looks along world -z with its up along +y, as OpenGL cameras do at rest.
 fn at_rest() -> Value {
@@ -63,6 +64,26 @@ fn opengl_cameras_become_world_to_camera() {
     assert_eq!(scene.points.positions, [[0.5, 1.0, -2.0], [1.0, 2.0, 3.0]]);
     assert_eq!(scene.points.colours, [[10, 20, 30], [255, 0, 1]]);
     assert_eq!(scene.warnings, Vec::<String>::new());
+}
+
+#[test]
+fn paths_of_a_foreign_scene_stay_in_its_folder() {
+    let foreign = |transforms: &Value| {
+        let dataset = dataset(transforms);
+        load_foreign_scene(&dataset.path(""), &DataConfig::default())
+    };
+    assert_eq!(foreign(&transforms()).unwrap().views.len(), 3);
+    for outside in ["../a.png", "/etc/hostname", "images/../../a.png", "C:\\a.png"] {
+        for (key, place) in [("file_path", "frames[1]: file_path"), ("mask_path", "frames[1]: mask_path")] {
+            let mut transforms = transforms();
+            transforms["frames"][1][key] = json!(outside);
+            let message = foreign(&transforms).unwrap_err().to_string();
+            assert_says(&message, &["transforms.json", place, "inside the dataset"]);
+        }
+        let mut transforms = transforms();
+        transforms["ply_file_path"] = json!(outside);
+        assert_says(&foreign(&transforms).unwrap_err().to_string(), &["ply_file_path", "inside the dataset"]);
+    }
 }
 
 #[test]

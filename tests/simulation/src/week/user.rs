@@ -21,6 +21,7 @@ impl Week {
         let partitions = self.random.within(1, 13) as u32;
         let request = format!("request-{}", self.submitted);
         let job = || NewJob {
+            announce: false,
             job_id: JobId::new(self.now_ms, self.submitted),
             tenant: TENANTS[self.submitted as usize % TENANTS.len()].parse().expect("a tenant"),
             request_id: request.clone(),

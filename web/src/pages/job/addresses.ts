@@ -1,7 +1,7 @@
 // Addresses of pictures in memory, which are valid until they are revoked.
 
 export class Addresses {
-    readonly #known: string[] = [];
+    readonly #known = new Set<string>();
     #isEnded = false;
 
     of(content: Blob): string {
@@ -10,13 +10,20 @@ export class Addresses {
             throw new DOMException('ended', 'AbortError');
         }
         const address = URL.createObjectURL(content);
-        this.#known.push(address);
+        this.#known.add(address);
         return address;
+    }
+
+    /** Revokes one address. A picture that is loaded stays on the page. */
+    free(address: string): void {
+        this.#known.delete(address);
+        URL.revokeObjectURL(address);
     }
 
     /** Revokes all addresses. Later there are no others. */
     revoke(): void {
         this.#isEnded = true;
-        this.#known.splice(0).forEach((address) => URL.revokeObjectURL(address));
+        this.#known.forEach((address) => URL.revokeObjectURL(address));
+        this.#known.clear();
     }
 }

@@ -12,16 +12,17 @@ const SELDOM_MS = 60_000;
 /** The history of a job with many tasks has megabytes: each point makes the pause so much longer. */
 const MS_PER_POINT = 0.5;
 
-/** Asks for the history of a job again and again, until the section is left. */
+/** Asks for the history of a job again and again, every `leastMs` at most, until the section is left. */
 export function followHistory(
     context: JobContext,
     onHistory: (history: History) => void,
     onFault: (fault: Fault) => void,
+    leastMs = EVERY_MS,
 ): Polling {
     const { id, session, signal } = context;
     let points = 0;
     const every = (): number =>
-        hasEnded(context.job.state) ? SELDOM_MS : Math.min(SELDOM_MS, EVERY_MS + MS_PER_POINT * points);
+        hasEnded(context.job.state) ? SELDOM_MS : Math.min(SELDOM_MS, leastMs + MS_PER_POINT * points);
     return poll(every, signal, async () => {
         try {
             const history = await session.api.jobs.getHistory({ jobId: id }, { signal });

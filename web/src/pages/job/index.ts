@@ -36,6 +36,7 @@ const SECTIONS: Readonly<Record<JobSection, () => Promise<{ readonly open: OpenS
     curves: () => import('./curves.ts'),
     views: () => import('./views.ts'),
     water: () => import('./water.ts'),
+    seams: () => import('./seams.ts'),
     log: () => import('./log.ts'),
     files: () => import('./files.ts'),
     settings: () => import('./settings.ts'),

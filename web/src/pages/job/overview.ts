@@ -1,6 +1,8 @@
 // What a job does now: its plan from above, its stages in time, and its tasks.
 
-import { type Task, TaskState } from '../../rpc/fathom/v1/job_pb.ts';
+import { timestampMs } from '@bufbuild/protobuf/wkt';
+
+import { type Task, type TaskHistory, TaskState } from '../../rpc/fathom/v1/job_pb.ts';
 import { Table, chip, h, only, setText } from '../dom.ts';
 import { countText, durationText } from '../format.ts';
 import type { ManifestContent, PlanContent } from '../parts/plan-layout.ts';
@@ -8,6 +10,9 @@ import { planMap } from '../parts/plan-map.ts';
 import { timeline } from '../parts/timeline.ts';
 import { capital, hasEnded, taskLabel, taskStateWord } from '../words.ts';
 import { Addresses } from './addresses.ts';
+import { boundsBar } from './bounds-bar.ts';
+import { verdictOf } from './bounds.ts';
+import { followHistory } from './history.ts';
 import { Photographs } from './photographs.ts';
 import type { JobContext, Section } from './section.ts';
 
@@ -16,6 +21,9 @@ import type { JobContext, Section } from './section.ts';
  */
 const DRAW_EVERY_MS = 250;
 const TICK_MS = 1000;
+/** What bounds the job is counted anew this often, and the history that it needs is asked for, milliseconds. */
+const COUNT_EVERY_MS = 3000;
+const HISTORY_EVERY_MS = 15_000;
 /** After a failure the plan is asked for again, but not at once. */
 const ASK_AGAIN_MS = 3000;
 const STATE_LABELS: Readonly<Record<string, string>> = { blocked: 'Waits for others', ready: 'Waits for a worker' };
@@ -68,7 +76,8 @@ export function open(container: HTMLElement, context: JobContext): Section {
     const timelineHost = h('div', { class: 'card' });
     const table = makeTable();
     const details = h('details', { class: 'more', ontoggle: () => draw() }, h('summary', {}, 'Tasks as a list'), h('div', { class: 'card flush' }, table.element));
-    container.append(h('h2', {}, 'Plan'), mapHost, h('h2', {}, 'Stages'), timelineHost, details);
+    const bounds = boundsBar();
+    container.append(bounds.element, h('h2', {}, 'Plan'), mapHost, h('h2', {}, 'Stages'), timelineHost, details);
 
     const addresses = new Addresses();
     const photographs = new Photographs(context);
@@ -119,9 +128,32 @@ export function open(container: HTMLElement, context: JobContext): Section {
             table.show(job.tasks);
         }
     }
+    let histories: readonly TaskHistory[] | null = null;
+    let countTimer = 0;
+    function count(): void {
+        countTimer = 0;
+        const { createTime, maxParallel } = context.job;
+        // Without the history nobody can tell training from waiting for photographs.
+        if (signal.aborted || histories === null || createTime === undefined) {
+            return;
+        }
+        const { tasks, events, nowMs } = record;
+        bounds.show(verdictOf({ tasks, histories, events, startMs: timestampMs(createTime), nowMs, maxParallel }));
+    }
+    followHistory(
+        context,
+        (history) => {
+            histories = history.tasks;
+            count();
+        },
+        // What was shown stays.
+        () => {},
+        HISTORY_EVERY_MS,
+    );
     let timer = 0;
     const update = (): void => {
         timer ||= window.setTimeout(draw, DRAW_EVERY_MS);
+        countTimer ||= window.setTimeout(count, COUNT_EVERY_MS);
     };
     // Bars of running tasks grow.
     const tick = setInterval(() => {
@@ -135,6 +167,7 @@ export function open(container: HTMLElement, context: JobContext): Section {
         destroy: () => {
             clearInterval(tick);
             clearTimeout(timer);
+            clearTimeout(countTimer);
             map.destroy();
             line.destroy();
             addresses.revoke();

@@ -45,6 +45,14 @@ export function seriesOf(tasks: readonly TaskHistory[]): readonly PreviewSeries[
     });
 }
 
+/** The digests of all pictures. */
+export const digestsOf = (tasks: readonly TaskHistory[]): ReadonlySet<string> =>
+    new Set(
+        tasks
+            .flatMap(({ previews }) => previews.flatMap(({ render, clear }) => [render?.digest ?? '', clear?.digest ?? '']))
+            .filter((digest) => digest !== ''),
+    );
+
 /** The series that is shown until the reader chooses: of a task that runs, otherwise of the last task. */
 export function firstSeries(series: readonly PreviewSeries[], running: ReadonlySet<string>): PreviewSeries | null {
     const last = series.at(-1)?.task;

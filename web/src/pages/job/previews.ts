@@ -13,7 +13,7 @@ import { hasEnded, taskLabel } from '../words.ts';
 import { Addresses } from './addresses.ts';
 import { followHistory } from './history.ts';
 import { Photographs } from './photographs.ts';
-import { type Frame, type PreviewSeries, firstSeries, frameAt, seriesOf } from './preview-series.ts';
+import { type Frame, type PreviewSeries, digestsOf, firstSeries, frameAt, seriesOf } from './preview-series.ts';
 import type { JobContext, Section } from './section.ts';
 
 /** Previews have at most this many pixels along a side. Photographs are made as small, to be compared. */
@@ -44,6 +44,8 @@ class Blobs {
     readonly #context: JobContext;
     readonly #addresses: Addresses;
     readonly #known = new Map<string, GetPicture>();
+    /** Addresses of the pictures that were read, by digest. */
+    readonly #read = new Map<string, string>();
     readonly #missing = new Map<string, number>();
     /** Pictures that could not be read since the last round. */
     readonly #failed = new Set<string>();
@@ -69,12 +71,30 @@ class Blobs {
         this.#failed.clear();
     }
 
+    /** Forgets all other pictures: the service keeps fewer and fewer of the earlier ones. */
+    keep(digests: ReadonlySet<string>): void {
+        for (const digest of this.#known.keys()) {
+            if (!digests.has(digest)) {
+                this.#known.delete(digest);
+                this.#missing.delete(digest);
+            }
+        }
+        for (const [digest, address] of this.#read) {
+            if (!digests.has(digest)) {
+                this.#read.delete(digest);
+                this.#addresses.free(address);
+            }
+        }
+    }
+
     #makeGet(digest: string): GetPicture {
         const { id, session, signal } = this.#context;
         let address: Promise<string> | null = null;
         const read = async (): Promise<string> => {
             try {
-                return this.#addresses.of(await session.api.blob(digest, id, signal, 'image/jpeg'));
+                const made = this.#addresses.of(await session.api.blob(digest, id, signal, 'image/jpeg'));
+                this.#read.set(digest, made);
+                return made;
             } catch (error) {
                 address = null;
                 this.#failed.add(digest);
@@ -245,6 +265,7 @@ export function openPreviews(container: HTMLElement, context: JobContext): Secti
         context,
         (history) => {
             ({ tasks } = history);
+            blobs.keep(digestsOf(tasks));
             blobs.again();
             draw();
         },

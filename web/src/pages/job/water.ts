@@ -1,41 +1,121 @@
-// The water of a job that has succeeded.
+// The water of a job: as it settles while tasks train it, and with its errors once the job has succeeded.
 
+import type { TaskHistory } from '../../rpc/fathom/v1/job_pb.ts';
+import { JobState } from '../../rpc/fathom/v1/job_pb.ts';
 import { problemOf } from '../context.ts';
 import { h } from '../dom.ts';
 import { faultOf } from '../faults.ts';
+import type { Part } from '../parts/part.ts';
 import { waterPanel } from '../parts/water-panel.ts';
+import { type WaterSettlingData, waterSettling } from '../parts/water-settling.ts';
 import type { WaterContent } from '../parts/water-values.ts';
-import { type JobContext, type Section, whenSucceeded } from './section.ts';
+import { hasEnded } from '../words.ts';
+import { followHistory } from './history.ts';
+import type { JobContext, Section } from './section.ts';
+import { isInAir, waterSeriesOf } from './water-history.ts';
 
 /** The keys of plan.json that are read. */
 interface Plan {
     readonly extent?: { readonly viewing_distance?: number | null };
 }
 
+function emptyText(context: JobContext): string {
+    const { state, configJson } = context.job;
+    if (isInAir(configJson)) {
+        return 'This job trains the scene as it looks in air (water.medium = none).';
+    }
+    return hasEnded(state)
+        ? 'The job did not succeed, and none of its tasks reported a water.'
+        : 'The water is shown here while it trains, and with its standard errors once the job has succeeded.';
+}
+
 export function open(container: HTMLElement, context: JobContext): Section {
-    let stop: (() => void) | null = null;
-    const show = async (): Promise<void> => {
-        container.replaceChildren(h('p', { class: 'loading', role: 'status' }, 'Loading the water …'));
+    const { signal } = context;
+    const finalHost = h('div', { class: 'section' });
+    const settlingHost = h('div', { class: 'card' });
+    const settlingTitle = h('h2', {}, 'How it settled');
+    const emptyWords = h('p');
+    const empty = h('div', { class: 'empty' }, h('h2', {}, 'Nothing yet'), emptyWords);
+    let panel: { destroy(): void } | null = null;
+    let settling: Part<WaterSettlingData> | null = null;
+    let histories: readonly TaskHistory[] = [];
+    let isFinalShown = false;
+
+    const showFinal = async (): Promise<void> => {
+        isFinalShown = true;
+        finalHost.replaceChildren(h('p', { class: 'loading', role: 'status' }, 'Loading the water …'));
         try {
             const [water, plan] = await Promise.all([context.json('water.json'), context.json('plan.json')]);
-            if (context.signal.aborted) {
+            if (signal.aborted) {
                 return;
             }
             const host = h('div', { class: 'card' });
-            container.replaceChildren(host);
-            const panel = waterPanel(host);
-            stop = () => panel.destroy();
-            panel.update({
+            finalHost.replaceChildren(host);
+            const shown = waterPanel(host);
+            panel = shown;
+            shown.update({
                 water: water as WaterContent | null,
                 viewingDistance: (plan as Plan | null)?.extent?.viewing_distance ?? null,
             });
         } catch (error) {
             const shown = problemOf('The water cannot be shown', faultOf(error));
             if (shown !== null) {
-                container.replaceChildren(shown);
+                finalHost.replaceChildren(shown);
             }
         }
     };
-    const section = whenSucceeded(container, context, 'The water', () => void show());
-    return { update: section.update, destroy: () => stop?.() };
+
+    function update(): void {
+        const { state, tasks } = context.job;
+        const hasFinal = state === JobState.SUCCEEDED;
+        if (hasFinal && !isFinalShown) {
+            void showFinal();
+        }
+        const series = waterSeriesOf(tasks, histories);
+        const isSettling = series.length > 0;
+        emptyWords.textContent = emptyText(context);
+        const parts = [
+            ...(hasFinal ? [finalHost] : []),
+            ...(isSettling && hasFinal ? [settlingTitle] : []),
+            ...(isSettling ? [settlingHost] : []),
+            ...(isSettling || hasFinal ? [] : [empty]),
+        ];
+        if (
+            parts.length !== container.children.length ||
+            parts.some((part, i) => part !== container.children[i])
+        ) {
+            container.replaceChildren(...parts);
+        }
+        if (isSettling) {
+            settling ??= waterSettling(settlingHost);
+            settling.update({ series });
+        }
+    }
+
+    const polling = followHistory(
+        context,
+        ({ tasks }) => {
+            histories = tasks;
+            if (!signal.aborted) {
+                update();
+            }
+        },
+        // What was shown stays. The header says when the service does not answer.
+        () => {},
+    );
+    let { state } = context.job;
+    update();
+    return {
+        update: () => {
+            if (context.job.state !== state) {
+                ({ state } = context.job);
+                polling.now();
+                update();
+            }
+        },
+        destroy: () => {
+            panel?.destroy();
+            settling?.destroy();
+        },
+    };
 }

@@ -5,7 +5,7 @@ import uPlot from 'uplot';
 import { h } from '../../viewer/dom.ts';
 import { colourReader } from './elements.ts';
 import { duration } from './format.ts';
-import { type Along, type Line, QUANTITIES, type Quantity, joined, placeText, valueAt } from './curve-points.ts';
+import { type Along, type ChartWords, type Line, joined, placeText, valueAt } from './curve-points.ts';
 
 /** A series as the chart draws it. */
 export interface DrawnLine {
@@ -14,6 +14,8 @@ export interface DrawnLine {
     readonly line: Line;
     readonly colour: string;
     readonly dash: readonly number[];
+    /** Thin and without a value below the chart: what the others are compared with. */
+    readonly isBehind?: boolean;
 }
 
 export interface Zoom {
@@ -28,6 +30,10 @@ export interface ChartActions {
 }
 
 const HEIGHT = 190;
+const WIDTH = 1.75;
+const WIDTH_BEHIND = 0.75;
+/** How much of a line behind is seen, as two digits after a colour. */
+const OPACITY_BEHIND = '80';
 /** Steps between marks along time, seconds. */
 const TIME_STEPS = [
     1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 10_800, 21_600, 43_200, 86_400, 172_800,
@@ -42,7 +48,7 @@ const roundOnly = (_: uPlot, splits: number[]): (number | null)[] =>
 
 export class Chart {
     readonly element: HTMLElement;
-    readonly quantity: Quantity;
+    readonly #words: ChartWords;
     readonly #actions: ChartActions;
     readonly #place = h('span', { class: 'fp-curve-place' });
     readonly #stage: HTMLElement;
@@ -56,10 +62,10 @@ export class Chart {
     #zoom: Zoom | null = null;
     #x: number | null = null;
 
-    constructor(quantity: Quantity, actions: ChartActions) {
-        this.quantity = quantity;
+    constructor(words: ChartWords, actions: ChartActions) {
+        this.#words = words;
         this.#actions = actions;
-        const { title } = QUANTITIES[quantity];
+        const { title } = words;
         this.#stage = h('div', {
             class: 'fp-curve-stage',
             tabindex: 0,
@@ -82,7 +88,7 @@ export class Chart {
         this.#nothing.hidden = !isEmpty;
         this.#stage.hidden = isEmpty;
         this.#readout.hidden = isEmpty;
-        this.#nothing.textContent = this.#whyNothing(lines.length);
+        this.#nothing.textContent = lines.length === 0 ? 'Choose a task above.' : this.#words.nothing;
         if (isEmpty) {
             this.#drop();
             return;
@@ -113,9 +119,10 @@ export class Chart {
     showPlace(x: number | null): void {
         this.#x = x;
         this.#place.textContent = x === null ? 'latest' : placeText(x, this.#along);
-        const { text } = QUANTITIES[this.quantity];
+        const { text } = this.#words;
+        const shown = this.#lines.filter(({ isBehind }) => isBehind !== true);
         this.#readout.replaceChildren(
-            ...this.#lines.map(({ label, line, colour, dash }) => {
+            ...shown.map(({ label, line, colour, dash }) => {
                 const value = x === null ? valueAt(line, Infinity) : valueAt(line, x);
                 const mark = h('span', { class: 'fp-swatch', 'aria-hidden': 'true' });
                 mark.style.borderTopColor = `var(${colour})`;
@@ -148,17 +155,6 @@ export class Chart {
         this.element.remove();
     }
 
-    #whyNothing(drawn: number): string {
-        if (drawn === 0) {
-            return 'Choose a task above.';
-        }
-        const words: Partial<Record<Quantity, string>> = {
-            psnr: 'Not measured yet. Held-out photographs are measured during training where train.eval_every is set.',
-            memory: 'The drivers of these workers do not report their memory.',
-        };
-        return words[this.quantity] ?? 'No values yet.';
-    }
-
     #drop(): void {
         this.#plot?.destroy();
         this.#plot = null;
@@ -176,9 +172,8 @@ export class Chart {
     #options(lines: readonly DrawnLine[], along: Along): uPlot.Options {
         const colour = colourReader(this.element);
         const axis = { stroke: colour('--soft'), font: FONT, grid: { stroke: colour('--line'), width: 1 } };
-        const { isLog, text } = QUANTITIES[this.quantity];
+        const { isLog, axisText, hasPoints, steps } = this.#words;
         const isTime = along === 'time';
-        const isMemory = this.quantity === 'memory';
         return {
             width: Math.max(200, this.#stage.clientWidth),
             height: HEIGHT,
@@ -187,12 +182,12 @@ export class Chart {
             scales: { x: { time: false }, y: isLog ? { distr: 3 } : {} },
             series: [
                 {},
-                ...lines.map(({ label, colour: name, dash, line }): uPlot.Series => ({
+                ...lines.map(({ label, colour: name, dash, line, isBehind }): uPlot.Series => ({
                     label,
-                    stroke: colour(name),
-                    width: 1.75,
+                    stroke: `${colour(name)}${isBehind === true ? OPACITY_BEHIND : ''}`,
+                    width: isBehind === true ? WIDTH_BEHIND : WIDTH,
                     dash: [...dash],
-                    points: { show: this.quantity === 'psnr' || line.xs.length < 3, size: 5, fill: colour(name) },
+                    points: { show: hasPoints === true || line.xs.length < 3, size: 5, fill: colour(name) },
                 })),
             ],
             axes: [
@@ -210,14 +205,8 @@ export class Chart {
                     ticks: { show: false },
                     ...(isLog ? { filter: roundOnly, grid: { ...axis.grid, filter: roundOnly } } : {}),
                     values: (_, splits) =>
-                        splits.map((y: number | null) => (y === null ? '' : this.#axisText(y, text))),
-                    ...(isMemory
-                        ? {
-                              incrs: [1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024, 2048, 4096, 8192, 16_384].map(
-                                  (m) => m * 2 ** 20,
-                              ),
-                          }
-                        : {}),
+                        splits.map((y: number | null) => (y === null ? '' : axisText(y))),
+                    ...(steps === undefined ? {} : { incrs: [...steps] }),
                 },
             ],
             cursor: {
@@ -258,23 +247,6 @@ export class Chart {
                 ],
             },
         };
-    }
-
-    #axisText(value: number, text: (value: number) => string): string {
-        if (this.quantity === 'psnr') {
-            return String(Number(value.toFixed(2)));
-        }
-        if (this.quantity === 'gaussians' && value >= 1e6) {
-            return `${Number((value / 1e6).toFixed(2))} M`;
-        }
-        if (this.quantity === 'loss') {
-            return String(Number(value.toPrecision(2)));
-        }
-        if (this.quantity === 'memory') {
-            // Marks lie at whole MiB, so that the digits after the point are zeros.
-            return text(value).replace(/\.0+ |(\.\d*[1-9])0+ /, '$1 ');
-        }
-        return this.quantity === 'rate' ? String(Number(value.toPrecision(3))) : text(value);
     }
 
     #press(event: KeyboardEvent): void {

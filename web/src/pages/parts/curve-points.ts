@@ -2,11 +2,15 @@
 
 import { brief, duration, grouped, memory } from './format.ts';
 
-/** A point of the curves of a task. */
-export interface CurvePoint {
+/** When something was measured. */
+export interface Moment {
     readonly timeMs: number;
     readonly attempt: number;
     readonly iteration: number;
+}
+
+/** A point of the curves of a task. */
+export interface CurvePoint extends Moment {
     readonly loss: number;
     /** On held-out views, dB; null before the first measurement. */
     readonly psnr: number | null;
@@ -33,18 +37,65 @@ export interface CurvesData {
 export type Quantity = 'loss' | 'psnr' | 'gaussians' | 'rate' | 'memory';
 export type Along = 'iteration' | 'time';
 
-export interface QuantityWords {
+/** What a chart shows, and how it writes values. */
+export interface ChartWords {
     readonly title: string;
     readonly isLog: boolean;
     text(value: number): string;
+    /** A value beside the axis. */
+    axisText(value: number): string;
+    /** What is said in place of a chart without values. */
+    readonly nothing: string;
+    /** Whether each value is a point of its own, since there are few. */
+    readonly hasPoints?: boolean;
+    /** Steps between marks of the axis, if not those of decimal numbers. */
+    readonly steps?: readonly number[];
 }
 
-export const QUANTITIES: Readonly<Record<Quantity, QuantityWords>> = {
-    loss: { title: 'Loss, logarithmic', isLog: true, text: (value) => brief(value) },
-    psnr: { title: 'PSNR on held-out photographs, dB', isLog: false, text: (value) => value.toFixed(2) },
-    gaussians: { title: 'Gaussians', isLog: false, text: grouped },
-    rate: { title: 'Iterations per second', isLog: false, text: (value) => brief(value) },
-    memory: { title: 'GPU memory', isLog: false, text: memory },
+const plain = (value: number, digits: number): string => String(Number(value.toPrecision(digits)));
+const NOTHING = 'No values yet.';
+/** From 1 MiB to 16 GiB. */
+const MEMORY_STEPS = Array.from({ length: 15 }, (_, power) => 2 ** (20 + power));
+
+export const QUANTITIES: Readonly<Record<Quantity, ChartWords>> = {
+    loss: {
+        title: 'Loss, logarithmic',
+        isLog: true,
+        text: (value) => brief(value),
+        axisText: (value) => plain(value, 2),
+        nothing: NOTHING,
+    },
+    psnr: {
+        title: 'PSNR on held-out photographs, dB',
+        isLog: false,
+        text: (value) => value.toFixed(2),
+        axisText: (value) => String(Number(value.toFixed(2))),
+        nothing: 'Not measured yet. Held-out photographs are measured during training where train.eval_every is set.',
+        hasPoints: true,
+    },
+    gaussians: {
+        title: 'Gaussians',
+        isLog: false,
+        text: grouped,
+        axisText: (value) => (value >= 1e6 ? `${Number((value / 1e6).toFixed(2))} M` : grouped(value)),
+        nothing: NOTHING,
+    },
+    rate: {
+        title: 'Iterations per second',
+        isLog: false,
+        text: (value) => brief(value),
+        axisText: (value) => plain(value, 3),
+        nothing: NOTHING,
+    },
+    memory: {
+        title: 'GPU memory',
+        isLog: false,
+        text: memory,
+        // Marks lie at whole MiB, so that the digits after the point are zeros.
+        axisText: (value) => memory(value).replace(/\.0+ |(\.\d*[1-9])0+ /, '$1 '),
+        nothing: 'The drivers of these workers do not report their memory.',
+        steps: MEMORY_STEPS,
+    },
 };
 
 /** The value of a point; null where it is not known, and where a logarithm does not exist. */
@@ -61,8 +112,8 @@ export function valueOf(point: CurvePoint, quantity: Quantity): number | null {
 }
 
 /** The points that still hold: an attempt that resumed earlier replaces those after its beginning. */
-export function currentPoints(points: readonly CurvePoint[]): CurvePoint[] {
-    const kept: CurvePoint[] = [];
+export function currentPoints<P extends Moment>(points: readonly P[]): P[] {
+    const kept: P[] = [];
     for (const point of points) {
         while (kept.length > 0 && kept.at(-1)!.iteration >= point.iteration) {
             kept.pop();
@@ -78,17 +129,33 @@ export interface Line {
     readonly ys: (number | null)[];
 }
 
-/**
- * The line of a task. Along time, which is counted in seconds from `startMs`, there is a gap between attempts.
- * Of a PSNR, which is reported until the next measurement, only the changes are kept.
- */
+/** The line of a quantity. Of a PSNR, which is reported until the next measurement, only the changes are kept. */
 export function lineOf(points: readonly CurvePoint[], quantity: Quantity, along: Along, startMs: number): Line {
-    const line: Line = { xs: [], ys: [] };
-    let before: CurvePoint | null = null;
     let last: number | null = null;
+    const value = (point: CurvePoint): number | null => {
+        const known = valueOf(point, quantity);
+        const isRepeated = quantity === 'psnr' && known === last;
+        last = known ?? last;
+        return isRepeated ? null : known;
+    };
+    return lineBy(points, value, along, startMs);
+}
+
+/**
+ * The line of a value of each point, where null is no point. Along time, which is counted in seconds from
+ * `startMs`, there is a gap between attempts.
+ */
+export function lineBy<P extends Moment>(
+    points: readonly P[],
+    valueOfPoint: (point: P) => number | null,
+    along: Along,
+    startMs: number,
+): Line {
+    const line: Line = { xs: [], ys: [] };
+    let before: P | null = null;
     for (const point of points) {
-        const value = valueOf(point, quantity);
-        if (value === null || (quantity === 'psnr' && value === last)) {
+        const value = valueOfPoint(point);
+        if (value === null) {
             continue;
         }
         const x = along === 'iteration' ? point.iteration : (point.timeMs - startMs) / 1000;
@@ -108,7 +175,7 @@ export function lineOf(points: readonly CurvePoint[], quantity: Quantity, along:
             line.xs.push(x);
             line.ys.push(value);
         }
-        [before, last] = [point, value];
+        before = point;
     }
     return line;
 }
@@ -136,8 +203,12 @@ export const startOf = (series: readonly CurveSeries[]): number =>
     series.reduce((first, { points }) => Math.min(first, points[0]?.timeMs ?? Infinity), Infinity);
 
 /** The part of x that has points; never without length. */
-export function spanOf(series: readonly CurveSeries[], along: Along, startMs: number): { min: number; max: number } {
-    const place = (point: CurvePoint): number =>
+export function spanOf(
+    series: readonly { readonly points: readonly Moment[] }[],
+    along: Along,
+    startMs: number,
+): { min: number; max: number } {
+    const place = (point: Moment): number =>
         along === 'iteration' ? point.iteration : (point.timeMs - startMs) / 1000;
     const ends = series.flatMap(({ points }) =>
         points.length === 0 ? [] : [place(points[0]!), place(points.at(-1)!)],

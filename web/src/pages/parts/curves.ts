@@ -53,7 +53,7 @@ class Curves implements Part<CurvesData> {
     readonly #search: HTMLInputElement;
     readonly #drawnWords = h('span', { class: 'fp-note' });
     readonly #wholeButton: HTMLButtonElement;
-    readonly #charts: readonly Chart[];
+    readonly #charts: ReadonlyMap<Quantity, Chart>;
     readonly #looks = new Looks();
     readonly #boxes = new Map<
         string,
@@ -94,7 +94,8 @@ class Curves implements Part<CurvesData> {
                 this.#frame.request();
             },
         };
-        this.#charts = (Object.keys(QUANTITIES) as Quantity[]).map((quantity) => new Chart(quantity, actions));
+        const quantities = Object.keys(QUANTITIES) as Quantity[];
+        this.#charts = new Map(quantities.map((quantity) => [quantity, new Chart(QUANTITIES[quantity], actions)]));
         const along = choice<Along>(
             'Draw along',
             [
@@ -157,7 +158,7 @@ class Curves implements Part<CurvesData> {
                 { class: 'fp-note fp-curve-hint' },
                 'Drag across a chart to zoom, double click to see everything.',
             ),
-            h('div', { class: 'fp-curve-grid' }, ...this.#charts.map(({ element }) => element)),
+            h('div', { class: 'fp-curve-grid' }, ...[...this.#charts.values()].map(({ element }) => element)),
             this.#table.element,
         );
         this.element.append(this.#empty, this.#body);
@@ -213,11 +214,11 @@ class Curves implements Part<CurvesData> {
         const drawn = this.#series.filter(({ task }) => this.#drawn.has(task));
         // All charts show the same part of x, also where one of them has values for a part only.
         const whole = spanOf(drawn, this.#along, startMs);
-        for (const chart of this.#charts) {
+        for (const [quantity, chart] of this.#charts) {
             const lines = drawn.map(({ task, label, points }): DrawnLine => ({
                 task,
                 label,
-                line: lineOf(points, chart.quantity, this.#along, startMs),
+                line: lineOf(points, quantity, this.#along, startMs),
                 ...this.#looks.of(task),
             }));
             chart.draw(lines, this.#along, whole, this.#zoom);

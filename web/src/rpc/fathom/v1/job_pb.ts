@@ -16,7 +16,7 @@ import type { Message, UnknownEnum } from "@bufbuild/protobuf";
  * Describes the file fathom/v1/job.proto.
  */
 export const file_fathom_v1_job: GenFile = /*@__PURE__*/
-  fileDesc("ChNmYXRob20vdjEvam9iLnByb3RvEglmYXRob20udjEiwwEKEENyZWF0ZUpvYlJlcXVlc3QSEgoKcmVxdWVzdF9pZBgBIAEoCRIMCgRuYW1lGAIgASgJEhMKC2NvbmZpZ19qc29uGAMgASgJEiQKCG1hbmlmZXN0GAQgASgLMhIuZmF0aG9tLnYxLkJsb2JSZWYSFgoOaW5nZXN0X3NlY29uZHMYBSABKAESEAoIcHJpb3JpdHkYBiABKAUSFAoMbWF4X3BhcmFsbGVsGAcgASgNEhIKCmRhdGFzZXRfaWQYCCABKAkiHwoNR2V0Sm9iUmVxdWVzdBIOCgZqb2JfaWQYASABKAkihAEKD0xpc3RKb2JzUmVxdWVzdBIRCglwYWdlX3NpemUYASABKA0SEgoKcGFnZV90b2tlbhgCIAEoCRIjCgZzdGF0ZXMYAyADKA4yEy5mYXRob20udjEuSm9iU3RhdGUSFQoNbmFtZV9jb250YWlucxgEIAEoCRIOCgZ0ZW5hbnQYBSABKAkiSQoQTGlzdEpvYnNSZXNwb25zZRIcCgRqb2JzGAEgAygLMg4uZmF0aG9tLnYxLkpvYhIXCg9uZXh0X3BhZ2VfdG9rZW4YAiABKAkiNAoPV2F0Y2hKb2JSZXF1ZXN0Eg4KBmpvYl9pZBgBIAEoCRIRCglhZnRlcl9zZXEYAiABKAQiMgoQQ2FuY2VsSm9iUmVxdWVzdBIOCgZqb2JfaWQYASABKAkSDgoGcmVhc29uGAIgASgJIjEKD1BhdXNlSm9iUmVxdWVzdBIOCgZqb2JfaWQYASABKAkSDgoGcmVhc29uGAIgASgJIiIKEFJlc3VtZUpvYlJlcXVlc3QSDgoGam9iX2lkGAEgASgJIiEKD1JldHJ5Sm9iUmVxdWVzdBIOCgZqb2JfaWQYASABKAkicgoQVXBkYXRlSm9iUmVxdWVzdBIOCgZqb2JfaWQYASABKAkSFQoIcHJpb3JpdHkYAiABKAVIAIgBARIZCgxtYXhfcGFyYWxsZWwYAyABKA1IAYgBAUILCglfcHJpb3JpdHlCDwoNX21heF9wYXJhbGxlbCIiChBEZWxldGVKb2JSZXF1ZXN0Eg4KBmpvYl9pZBgBIAEoCSITChFEZWxldGVKb2JSZXNwb25zZSI0ChFHZXRIaXN0b3J5UmVxdWVzdBIOCgZqb2JfaWQYASABKAkSDwoHdGFza19pZBgCIAEoCSIwCgdIaXN0b3J5EiUKBXRhc2tzGAEgAygLMhYuZmF0aG9tLnYxLlRhc2tIaXN0b3J5Im0KC1Rhc2tIaXN0b3J5Eg8KB3Rhc2tfaWQYASABKAkSJwoGcG9pbnRzGAIgAygLMhcuZmF0aG9tLnYxLkhpc3RvcnlQb2ludBIkCghwcmV2aWV3cxgDIAMoCzISLmZhdGhvbS52MS5QcmV2aWV3InEKB1ByZXZpZXcSDAoEdmlldxgBIAEoCRIRCglpdGVyYXRpb24YAiABKA0SIgoGcmVuZGVyGAMgASgLMhIuZmF0aG9tLnYxLkJsb2JSZWYSIQoFY2xlYXIYBCABKAsyEi5mYXRob20udjEuQmxvYlJlZiJwCgxIaXN0b3J5UG9pbnQSKAoEdGltZRgBIAEoCzIaLmdvb2dsZS5wcm90b2J1Zi5UaW1lc3RhbXASDwoHYXR0ZW1wdBgCIAEoDRIlCghwcm9ncmVzcxgDIAEoCzITLmZhdGhvbS52MS5Qcm9ncmVzcyI9Cg9TaGFyZUpvYlJlcXVlc3QSDgoGam9iX2lkGAEgASgJEhoKEmV4cGlyZXNfaW5fc2Vjb25kcxgCIAEoBCJlChBTaGFyZUpvYlJlc3BvbnNlEg4KBnNlY3JldBgBIAEoCRIQCgh0b2tlbl9pZBgCIAEoCRIvCgtleHBpcmVfdGltZRgDIAEoCzIaLmdvb2dsZS5wcm90b2J1Zi5UaW1lc3RhbXAiTQoUTGlzdEFydGlmYWN0c1JlcXVlc3QSDgoGam9iX2lkGAEgASgJEhEKCXBhZ2Vfc2l6ZRgCIAEoDRISCgpwYWdlX3Rva2VuGAMgASgJIlgKFUxpc3RBcnRpZmFjdHNSZXNwb25zZRImCglhcnRpZmFjdHMYASADKAsyEy5mYXRob20udjEuQXJ0aWZhY3QSFwoPbmV4dF9wYWdlX3Rva2VuGAIgASgJIjoKCEFydGlmYWN0EgwKBHBhdGgYASABKAkSIAoEYmxvYhgCIAEoCzISLmZhdGhvbS52MS5CbG9iUmVmIu4ECgNKb2ISDgoGam9iX2lkGAEgASgJEgwKBG5hbWUYAiABKAkSIgoFc3RhdGUYAyABKA4yEy5mYXRob20udjEuSm9iU3RhdGUSHwoFc3RhZ2UYBCABKA4yEC5mYXRob20udjEuU3RhZ2USLwoLY3JlYXRlX3RpbWUYBSABKAsyGi5nb29nbGUucHJvdG9idWYuVGltZXN0YW1wEiwKCGVuZF90aW1lGAYgASgLMhouZ29vZ2xlLnByb3RvYnVmLlRpbWVzdGFtcBINCgVlcnJvchgHIAEoCRITCgtjb25maWdfanNvbhgIIAEoCRIkCghtYW5pZmVzdBgJIAEoCzISLmZhdGhvbS52MS5CbG9iUmVmEhAKCGxhc3Rfc2VxGAogASgEEhIKCnBhcnRpdGlvbnMYCyABKA0SEAoIcHJvZ3Jlc3MYDCABKAESHgoFdGFza3MYDSADKAsyDy5mYXRob20udjEuVGFzaxIWCg53YWl0aW5nX3JlYXNvbhgOIAEoCRIgCgRwbGFuGA8gASgLMhIuZmF0aG9tLnYxLkJsb2JSZWYSEAoIcHJpb3JpdHkYECABKAUSFAoMbWF4X3BhcmFsbGVsGBEgASgNEjEKDXdhaXRpbmdfc2luY2UYEiABKAsyGi5nb29nbGUucHJvdG9idWYuVGltZXN0YW1wEg4KBnRlbmFudBgTIAEoCRIeChF0aW1lX2xlZnRfc2Vjb25kcxgUIAEoAUgAiAEBEhIKCmRhdGFzZXRfaWQYFSABKAkSFAoMcGF1c2VfcmVhc29uGBYgASgJQhQKEl90aW1lX2xlZnRfc2Vjb25kcyLqAgoEVGFzaxIPCgd0YXNrX2lkGAEgASgJEh8KBXN0YWdlGAIgASgOMhAuZmF0aG9tLnYxLlN0YWdlEhEKCXBhcnRpdGlvbhgDIAEoDRIjCgVzdGF0ZRgEIAEoDjIULmZhdGhvbS52MS5UYXNrU3RhdGUSEAoIYXR0ZW1wdHMYBSABKA0SDgoGZXJyb3JzGAYgASgNEg4KBmxvc3NlcxgHIAEoDRIOCgZ3b3JrZXIYCCABKAkSJQoIcHJvZ3Jlc3MYCSABKAsyEy5mYXRob20udjEuUHJvZ3Jlc3MSHgoWcmVzdW1lZF9mcm9tX2l0ZXJhdGlvbhgKIAEoDRIcChRjaGVja3BvaW50X2l0ZXJhdGlvbhgLIAEoDRITCgtsYXN0X2Vycm9ycxgMIAMoCRIPCgdzZWNvbmRzGA0gASgBEhQKDG1lbW9yeV9ieXRlcxgOIAEoBBIVCg1zZWNvbmRfd29ya2VyGA8gASgJIrQBCghQcm9ncmVzcxIRCglpdGVyYXRpb24YASABKA0SEgoKaXRlcmF0aW9ucxgCIAEoDRIRCglnYXVzc2lhbnMYAyABKA0SDAoEbG9zcxgEIAEoAhIdChVpdGVyYXRpb25zX3Blcl9zZWNvbmQYBSABKAISKwoIaGVsZF9vdXQYBiABKAsyGS5mYXRob20udjEuSGVsZE91dE1ldHJpY3MSFAoMbWVtb3J5X2J5dGVzGAcgASgEIlEKDkhlbGRPdXRNZXRyaWNzEhEKCWl0ZXJhdGlvbhgBIAEoDRIPCgdwc25yX2RiGAIgASgBEgwKBHNzaW0YAyABKAESDQoFdmlld3MYBCABKA0iyQMKCEpvYkV2ZW50Eg4KBmpvYl9pZBgBIAEoCRILCgNzZXEYAiABKAQSKAoEdGltZRgDIAEoCzIaLmdvb2dsZS5wcm90b2J1Zi5UaW1lc3RhbXASLwoJam9iX3N0YXRlGAQgASgLMhouZmF0aG9tLnYxLkpvYlN0YXRlQ2hhbmdlZEgAEi8KCWpvYl9zdGFnZRgFIAEoCzIaLmZhdGhvbS52MS5Kb2JTdGFnZUNoYW5nZWRIABIuCgx0YXNrX2NoYW5nZWQYBiABKAsyFi5mYXRob20udjEuVGFza0NoYW5nZWRIABIrCghwcm9ncmVzcxgHIAEoCzIXLmZhdGhvbS52MS5UYXNrUHJvZ3Jlc3NIABIxCgpjaGVja3BvaW50GAggASgLMhsuZmF0aG9tLnYxLlRhc2tDaGVja3BvaW50ZWRIABIlCgd3YXJuaW5nGAkgASgLMhIuZmF0aG9tLnYxLldhcm5pbmdIABIqCgprZWVwX2FsaXZlGAogASgLMhQuZmF0aG9tLnYxLktlZXBBbGl2ZUgAEigKB3VwZGF0ZWQYCyABKAsyFS5mYXRob20udjEuSm9iVXBkYXRlZEgAQgcKBWV2ZW50IjQKCkpvYlVwZGF0ZWQSEAoIcHJpb3JpdHkYASABKAUSFAoMbWF4X3BhcmFsbGVsGAIgASgNIkYKD0pvYlN0YXRlQ2hhbmdlZBIiCgVzdGF0ZRgBIAEoDjITLmZhdGhvbS52MS5Kb2JTdGF0ZRIPCgdtZXNzYWdlGAIgASgJIkEKD0pvYlN0YWdlQ2hhbmdlZBIfCgVzdGFnZRgBIAEoDjIQLmZhdGhvbS52MS5TdGFnZRINCgV0YXNrcxgCIAEoDSK2AQoLVGFza0NoYW5nZWQSDwoHdGFza19pZBgBIAEoCRIfCgVzdGFnZRgCIAEoDjIQLmZhdGhvbS52MS5TdGFnZRIjCgVzdGF0ZRgDIAEoDjIULmZhdGhvbS52MS5UYXNrU3RhdGUSDwoHYXR0ZW1wdBgEIAEoDRIOCgZ3b3JrZXIYBSABKAkSDwoHbWVzc2FnZRgGIAEoCRIeChZyZXN1bWVkX2Zyb21faXRlcmF0aW9uGAcgASgNIlwKDFRhc2tQcm9ncmVzcxIPCgd0YXNrX2lkGAEgASgJEiUKCHByb2dyZXNzGAIgASgLMhMuZmF0aG9tLnYxLlByb2dyZXNzEhQKDGpvYl9wcm9ncmVzcxgDIAEoASJHChBUYXNrQ2hlY2twb2ludGVkEg8KB3Rhc2tfaWQYASABKAkSDwoHYXR0ZW1wdBgCIAEoDRIRCglpdGVyYXRpb24YAyABKA0iGgoHV2FybmluZxIPCgdtZXNzYWdlGAEgASgJIgsKCUtlZXBBbGl2ZSqaAQoISm9iU3RhdGUSGQoVSk9CX1NUQVRFX1VOU1BFQ0lGSUVEEAASFQoRSk9CX1NUQVRFX1JVTk5JTkcQARIXChNKT0JfU1RBVEVfU1VDQ0VFREVEEAISFAoQSk9CX1NUQVRFX0ZBSUxFRBADEhcKE0pPQl9TVEFURV9DQU5DRUxMRUQQBBIUChBKT0JfU1RBVEVfUEFVU0VEEAUqzAEKBVN0YWdlEhUKEVNUQUdFX1VOU1BFQ0lGSUVEEAASDgoKU1RBR0VfUExBThABEhAKDFNUQUdFX0dMT0JBTBACEhQKEFNUQUdFX0ZJUlNUX1BBUlQQAxISCg5TVEFHRV9FWENIQU5HRRAEEhMKD1NUQUdFX1BBUlRJVElPThAFEg8KC1NUQUdFX01FUkdFEAYSEQoNU1RBR0VfQk9SREVSUxAHEhIKDlNUQUdFX0VWQUxVQVRFEAgSEwoPU1RBR0VfQVJUSUZBQ1RTEAkqsAEKCVRhc2tTdGF0ZRIaChZUQVNLX1NUQVRFX1VOU1BFQ0lGSUVEEAASFgoSVEFTS19TVEFURV9CTE9DS0VEEAESFAoQVEFTS19TVEFURV9SRUFEWRACEhUKEVRBU0tfU1RBVEVfTEVBU0VEEAMSEwoPVEFTS19TVEFURV9ET05FEAQSEwoPVEFTS19TVEFURV9ERUFEEAUSGAoUVEFTS19TVEFURV9DQU5DRUxMRUQQBjKABwoKSm9iU2VydmljZRI4CglDcmVhdGVKb2ISGy5mYXRob20udjEuQ3JlYXRlSm9iUmVxdWVzdBoOLmZhdGhvbS52MS5Kb2ISMgoGR2V0Sm9iEhguZmF0aG9tLnYxLkdldEpvYlJlcXVlc3QaDi5mYXRob20udjEuSm9iEkMKCExpc3RKb2JzEhouZmF0aG9tLnYxLkxpc3RKb2JzUmVxdWVzdBobLmZhdGhvbS52MS5MaXN0Sm9ic1Jlc3BvbnNlEj0KCFdhdGNoSm9iEhouZmF0aG9tLnYxLldhdGNoSm9iUmVxdWVzdBoTLmZhdGhvbS52MS5Kb2JFdmVudDABEjgKCUNhbmNlbEpvYhIbLmZhdGhvbS52MS5DYW5jZWxKb2JSZXF1ZXN0Gg4uZmF0aG9tLnYxLkpvYhI2CghQYXVzZUpvYhIaLmZhdGhvbS52MS5QYXVzZUpvYlJlcXVlc3QaDi5mYXRob20udjEuSm9iEjgKCVJlc3VtZUpvYhIbLmZhdGhvbS52MS5SZXN1bWVKb2JSZXF1ZXN0Gg4uZmF0aG9tLnYxLkpvYhI2CghSZXRyeUpvYhIaLmZhdGhvbS52MS5SZXRyeUpvYlJlcXVlc3QaDi5mYXRob20udjEuSm9iEjgKCVVwZGF0ZUpvYhIbLmZhdGhvbS52MS5VcGRhdGVKb2JSZXF1ZXN0Gg4uZmF0aG9tLnYxLkpvYhJGCglEZWxldGVKb2ISGy5mYXRob20udjEuRGVsZXRlSm9iUmVxdWVzdBocLmZhdGhvbS52MS5EZWxldGVKb2JSZXNwb25zZRJBCgpTdHJlYW1Mb2dzEhwuZmF0aG9tLnYxLlN0cmVhbUxvZ3NSZXF1ZXN0GhMuZmF0aG9tLnYxLkxvZ0VudHJ5MAESPgoKR2V0SGlzdG9yeRIcLmZhdGhvbS52MS5HZXRIaXN0b3J5UmVxdWVzdBoSLmZhdGhvbS52MS5IaXN0b3J5EkMKCFNoYXJlSm9iEhouZmF0aG9tLnYxLlNoYXJlSm9iUmVxdWVzdBobLmZhdGhvbS52MS5TaGFyZUpvYlJlc3BvbnNlElIKDUxpc3RBcnRpZmFjdHMSHy5mYXRob20udjEuTGlzdEFydGlmYWN0c1JlcXVlc3QaIC5mYXRob20udjEuTGlzdEFydGlmYWN0c1Jlc3BvbnNlYgZwcm90bzM", [file_fathom_v1_blob, file_fathom_v1_log, file_google_protobuf_timestamp]);
+  fileDesc("ChNmYXRob20vdjEvam9iLnByb3RvEglmYXRob20udjEiwwEKEENyZWF0ZUpvYlJlcXVlc3QSEgoKcmVxdWVzdF9pZBgBIAEoCRIMCgRuYW1lGAIgASgJEhMKC2NvbmZpZ19qc29uGAMgASgJEiQKCG1hbmlmZXN0GAQgASgLMhIuZmF0aG9tLnYxLkJsb2JSZWYSFgoOaW5nZXN0X3NlY29uZHMYBSABKAESEAoIcHJpb3JpdHkYBiABKAUSFAoMbWF4X3BhcmFsbGVsGAcgASgNEhIKCmRhdGFzZXRfaWQYCCABKAkiHwoNR2V0Sm9iUmVxdWVzdBIOCgZqb2JfaWQYASABKAkihAEKD0xpc3RKb2JzUmVxdWVzdBIRCglwYWdlX3NpemUYASABKA0SEgoKcGFnZV90b2tlbhgCIAEoCRIjCgZzdGF0ZXMYAyADKA4yEy5mYXRob20udjEuSm9iU3RhdGUSFQoNbmFtZV9jb250YWlucxgEIAEoCRIOCgZ0ZW5hbnQYBSABKAkiSQoQTGlzdEpvYnNSZXNwb25zZRIcCgRqb2JzGAEgAygLMg4uZmF0aG9tLnYxLkpvYhIXCg9uZXh0X3BhZ2VfdG9rZW4YAiABKAkiNAoPV2F0Y2hKb2JSZXF1ZXN0Eg4KBmpvYl9pZBgBIAEoCRIRCglhZnRlcl9zZXEYAiABKAQiMgoQQ2FuY2VsSm9iUmVxdWVzdBIOCgZqb2JfaWQYASABKAkSDgoGcmVhc29uGAIgASgJIjEKD1BhdXNlSm9iUmVxdWVzdBIOCgZqb2JfaWQYASABKAkSDgoGcmVhc29uGAIgASgJIiIKEFJlc3VtZUpvYlJlcXVlc3QSDgoGam9iX2lkGAEgASgJIiEKD1JldHJ5Sm9iUmVxdWVzdBIOCgZqb2JfaWQYASABKAkicgoQVXBkYXRlSm9iUmVxdWVzdBIOCgZqb2JfaWQYASABKAkSFQoIcHJpb3JpdHkYAiABKAVIAIgBARIZCgxtYXhfcGFyYWxsZWwYAyABKA1IAYgBAUILCglfcHJpb3JpdHlCDwoNX21heF9wYXJhbGxlbCIiChBEZWxldGVKb2JSZXF1ZXN0Eg4KBmpvYl9pZBgBIAEoCSITChFEZWxldGVKb2JSZXNwb25zZSI0ChFHZXRIaXN0b3J5UmVxdWVzdBIOCgZqb2JfaWQYASABKAkSDwoHdGFza19pZBgCIAEoCSIwCgdIaXN0b3J5EiUKBXRhc2tzGAEgAygLMhYuZmF0aG9tLnYxLlRhc2tIaXN0b3J5Im0KC1Rhc2tIaXN0b3J5Eg8KB3Rhc2tfaWQYASABKAkSJwoGcG9pbnRzGAIgAygLMhcuZmF0aG9tLnYxLkhpc3RvcnlQb2ludBIkCghwcmV2aWV3cxgDIAMoCzISLmZhdGhvbS52MS5QcmV2aWV3InEKB1ByZXZpZXcSDAoEdmlldxgBIAEoCRIRCglpdGVyYXRpb24YAiABKA0SIgoGcmVuZGVyGAMgASgLMhIuZmF0aG9tLnYxLkJsb2JSZWYSIQoFY2xlYXIYBCABKAsyEi5mYXRob20udjEuQmxvYlJlZiJwCgxIaXN0b3J5UG9pbnQSKAoEdGltZRgBIAEoCzIaLmdvb2dsZS5wcm90b2J1Zi5UaW1lc3RhbXASDwoHYXR0ZW1wdBgCIAEoDRIlCghwcm9ncmVzcxgDIAEoCzITLmZhdGhvbS52MS5Qcm9ncmVzcyI9Cg9TaGFyZUpvYlJlcXVlc3QSDgoGam9iX2lkGAEgASgJEhoKEmV4cGlyZXNfaW5fc2Vjb25kcxgCIAEoBCJlChBTaGFyZUpvYlJlc3BvbnNlEg4KBnNlY3JldBgBIAEoCRIQCgh0b2tlbl9pZBgCIAEoCRIvCgtleHBpcmVfdGltZRgDIAEoCzIaLmdvb2dsZS5wcm90b2J1Zi5UaW1lc3RhbXAiTQoUTGlzdEFydGlmYWN0c1JlcXVlc3QSDgoGam9iX2lkGAEgASgJEhEKCXBhZ2Vfc2l6ZRgCIAEoDRISCgpwYWdlX3Rva2VuGAMgASgJIlgKFUxpc3RBcnRpZmFjdHNSZXNwb25zZRImCglhcnRpZmFjdHMYASADKAsyEy5mYXRob20udjEuQXJ0aWZhY3QSFwoPbmV4dF9wYWdlX3Rva2VuGAIgASgJIjoKCEFydGlmYWN0EgwKBHBhdGgYASABKAkSIAoEYmxvYhgCIAEoCzISLmZhdGhvbS52MS5CbG9iUmVmIu4ECgNKb2ISDgoGam9iX2lkGAEgASgJEgwKBG5hbWUYAiABKAkSIgoFc3RhdGUYAyABKA4yEy5mYXRob20udjEuSm9iU3RhdGUSHwoFc3RhZ2UYBCABKA4yEC5mYXRob20udjEuU3RhZ2USLwoLY3JlYXRlX3RpbWUYBSABKAsyGi5nb29nbGUucHJvdG9idWYuVGltZXN0YW1wEiwKCGVuZF90aW1lGAYgASgLMhouZ29vZ2xlLnByb3RvYnVmLlRpbWVzdGFtcBINCgVlcnJvchgHIAEoCRITCgtjb25maWdfanNvbhgIIAEoCRIkCghtYW5pZmVzdBgJIAEoCzISLmZhdGhvbS52MS5CbG9iUmVmEhAKCGxhc3Rfc2VxGAogASgEEhIKCnBhcnRpdGlvbnMYCyABKA0SEAoIcHJvZ3Jlc3MYDCABKAESHgoFdGFza3MYDSADKAsyDy5mYXRob20udjEuVGFzaxIWCg53YWl0aW5nX3JlYXNvbhgOIAEoCRIgCgRwbGFuGA8gASgLMhIuZmF0aG9tLnYxLkJsb2JSZWYSEAoIcHJpb3JpdHkYECABKAUSFAoMbWF4X3BhcmFsbGVsGBEgASgNEjEKDXdhaXRpbmdfc2luY2UYEiABKAsyGi5nb29nbGUucHJvdG9idWYuVGltZXN0YW1wEg4KBnRlbmFudBgTIAEoCRIeChF0aW1lX2xlZnRfc2Vjb25kcxgUIAEoAUgAiAEBEhIKCmRhdGFzZXRfaWQYFSABKAkSFAoMcGF1c2VfcmVhc29uGBYgASgJQhQKEl90aW1lX2xlZnRfc2Vjb25kcyKNAwoEVGFzaxIPCgd0YXNrX2lkGAEgASgJEh8KBXN0YWdlGAIgASgOMhAuZmF0aG9tLnYxLlN0YWdlEhEKCXBhcnRpdGlvbhgDIAEoDRIjCgVzdGF0ZRgEIAEoDjIULmZhdGhvbS52MS5UYXNrU3RhdGUSEAoIYXR0ZW1wdHMYBSABKA0SDgoGZXJyb3JzGAYgASgNEg4KBmxvc3NlcxgHIAEoDRIOCgZ3b3JrZXIYCCABKAkSJQoIcHJvZ3Jlc3MYCSABKAsyEy5mYXRob20udjEuUHJvZ3Jlc3MSHgoWcmVzdW1lZF9mcm9tX2l0ZXJhdGlvbhgKIAEoDRIcChRjaGVja3BvaW50X2l0ZXJhdGlvbhgLIAEoDRITCgtsYXN0X2Vycm9ycxgMIAMoCRIPCgdzZWNvbmRzGA0gASgBEhQKDG1lbW9yeV9ieXRlcxgOIAEoBBIVCg1zZWNvbmRfd29ya2VyGA8gASgJEiEKBW1vZGVsGBAgASgLMhIuZmF0aG9tLnYxLkJsb2JSZWYiggIKCFByb2dyZXNzEhEKCWl0ZXJhdGlvbhgBIAEoDRISCgppdGVyYXRpb25zGAIgASgNEhEKCWdhdXNzaWFucxgDIAEoDRIMCgRsb3NzGAQgASgCEh0KFWl0ZXJhdGlvbnNfcGVyX3NlY29uZBgFIAEoAhIrCghoZWxkX291dBgGIAEoCzIZLmZhdGhvbS52MS5IZWxkT3V0TWV0cmljcxIUCgxtZW1vcnlfYnl0ZXMYByABKAQSIgoFd2F0ZXIYCCABKAsyEy5mYXRob20udjEuV2F0ZXJOb3cSKAoKdGltZV9zcGVudBgJIAEoCzIULmZhdGhvbS52MS5UaW1lU3BlbnQiaQoIV2F0ZXJOb3cSHgoGYmV0YV9kGAEgASgLMg4uZmF0aG9tLnYxLlJnYhIeCgZiZXRhX2IYAiABKAsyDi5mYXRob20udjEuUmdiEh0KBWJfaW5mGAMgASgLMg4uZmF0aG9tLnYxLlJnYiIvCgNSZ2ISCwoDcmVkGAEgASgCEg0KBWdyZWVuGAIgASgCEgwKBGJsdWUYAyABKAIioAEKCVRpbWVTcGVudBIPCgdzZWNvbmRzGAEgASgCEhgKEGZldGNoaW5nX3NlY29uZHMYAiABKAISGAoQdHJhaW5pbmdfc2Vjb25kcxgDIAEoAhIbChNwaG90b2dyYXBoc19zZWNvbmRzGAQgASgCEhgKEHdhdGNoaW5nX3NlY29uZHMYBSABKAISFwoPc2VuZGluZ19zZWNvbmRzGAYgASgCIlEKDkhlbGRPdXRNZXRyaWNzEhEKCWl0ZXJhdGlvbhgBIAEoDRIPCgdwc25yX2RiGAIgASgBEgwKBHNzaW0YAyABKAESDQoFdmlld3MYBCABKA0iyQMKCEpvYkV2ZW50Eg4KBmpvYl9pZBgBIAEoCRILCgNzZXEYAiABKAQSKAoEdGltZRgDIAEoCzIaLmdvb2dsZS5wcm90b2J1Zi5UaW1lc3RhbXASLwoJam9iX3N0YXRlGAQgASgLMhouZmF0aG9tLnYxLkpvYlN0YXRlQ2hhbmdlZEgAEi8KCWpvYl9zdGFnZRgFIAEoCzIaLmZhdGhvbS52MS5Kb2JTdGFnZUNoYW5nZWRIABIuCgx0YXNrX2NoYW5nZWQYBiABKAsyFi5mYXRob20udjEuVGFza0NoYW5nZWRIABIrCghwcm9ncmVzcxgHIAEoCzIXLmZhdGhvbS52MS5UYXNrUHJvZ3Jlc3NIABIxCgpjaGVja3BvaW50GAggASgLMhsuZmF0aG9tLnYxLlRhc2tDaGVja3BvaW50ZWRIABIlCgd3YXJuaW5nGAkgASgLMhIuZmF0aG9tLnYxLldhcm5pbmdIABIqCgprZWVwX2FsaXZlGAogASgLMhQuZmF0aG9tLnYxLktlZXBBbGl2ZUgAEigKB3VwZGF0ZWQYCyABKAsyFS5mYXRob20udjEuSm9iVXBkYXRlZEgAQgcKBWV2ZW50IjQKCkpvYlVwZGF0ZWQSEAoIcHJpb3JpdHkYASABKAUSFAoMbWF4X3BhcmFsbGVsGAIgASgNIkYKD0pvYlN0YXRlQ2hhbmdlZBIiCgVzdGF0ZRgBIAEoDjITLmZhdGhvbS52MS5Kb2JTdGF0ZRIPCgdtZXNzYWdlGAIgASgJIkEKD0pvYlN0YWdlQ2hhbmdlZBIfCgVzdGFnZRgBIAEoDjIQLmZhdGhvbS52MS5TdGFnZRINCgV0YXNrcxgCIAEoDSK2AQoLVGFza0NoYW5nZWQSDwoHdGFza19pZBgBIAEoCRIfCgVzdGFnZRgCIAEoDjIQLmZhdGhvbS52MS5TdGFnZRIjCgVzdGF0ZRgDIAEoDjIULmZhdGhvbS52MS5UYXNrU3RhdGUSDwoHYXR0ZW1wdBgEIAEoDRIOCgZ3b3JrZXIYBSABKAkSDwoHbWVzc2FnZRgGIAEoCRIeChZyZXN1bWVkX2Zyb21faXRlcmF0aW9uGAcgASgNIlwKDFRhc2tQcm9ncmVzcxIPCgd0YXNrX2lkGAEgASgJEiUKCHByb2dyZXNzGAIgASgLMhMuZmF0aG9tLnYxLlByb2dyZXNzEhQKDGpvYl9wcm9ncmVzcxgDIAEoASJHChBUYXNrQ2hlY2twb2ludGVkEg8KB3Rhc2tfaWQYASABKAkSDwoHYXR0ZW1wdBgCIAEoDRIRCglpdGVyYXRpb24YAyABKA0iGgoHV2FybmluZxIPCgdtZXNzYWdlGAEgASgJIgsKCUtlZXBBbGl2ZSqaAQoISm9iU3RhdGUSGQoVSk9CX1NUQVRFX1VOU1BFQ0lGSUVEEAASFQoRSk9CX1NUQVRFX1JVTk5JTkcQARIXChNKT0JfU1RBVEVfU1VDQ0VFREVEEAISFAoQSk9CX1NUQVRFX0ZBSUxFRBADEhcKE0pPQl9TVEFURV9DQU5DRUxMRUQQBBIUChBKT0JfU1RBVEVfUEFVU0VEEAUqzAEKBVN0YWdlEhUKEVNUQUdFX1VOU1BFQ0lGSUVEEAASDgoKU1RBR0VfUExBThABEhAKDFNUQUdFX0dMT0JBTBACEhQKEFNUQUdFX0ZJUlNUX1BBUlQQAxISCg5TVEFHRV9FWENIQU5HRRAEEhMKD1NUQUdFX1BBUlRJVElPThAFEg8KC1NUQUdFX01FUkdFEAYSEQoNU1RBR0VfQk9SREVSUxAHEhIKDlNUQUdFX0VWQUxVQVRFEAgSEwoPU1RBR0VfQVJUSUZBQ1RTEAkqsAEKCVRhc2tTdGF0ZRIaChZUQVNLX1NUQVRFX1VOU1BFQ0lGSUVEEAASFgoSVEFTS19TVEFURV9CTE9DS0VEEAESFAoQVEFTS19TVEFURV9SRUFEWRACEhUKEVRBU0tfU1RBVEVfTEVBU0VEEAMSEwoPVEFTS19TVEFURV9ET05FEAQSEwoPVEFTS19TVEFURV9ERUFEEAUSGAoUVEFTS19TVEFURV9DQU5DRUxMRUQQBjKABwoKSm9iU2VydmljZRI4CglDcmVhdGVKb2ISGy5mYXRob20udjEuQ3JlYXRlSm9iUmVxdWVzdBoOLmZhdGhvbS52MS5Kb2ISMgoGR2V0Sm9iEhguZmF0aG9tLnYxLkdldEpvYlJlcXVlc3QaDi5mYXRob20udjEuSm9iEkMKCExpc3RKb2JzEhouZmF0aG9tLnYxLkxpc3RKb2JzUmVxdWVzdBobLmZhdGhvbS52MS5MaXN0Sm9ic1Jlc3BvbnNlEj0KCFdhdGNoSm9iEhouZmF0aG9tLnYxLldhdGNoSm9iUmVxdWVzdBoTLmZhdGhvbS52MS5Kb2JFdmVudDABEjgKCUNhbmNlbEpvYhIbLmZhdGhvbS52MS5DYW5jZWxKb2JSZXF1ZXN0Gg4uZmF0aG9tLnYxLkpvYhI2CghQYXVzZUpvYhIaLmZhdGhvbS52MS5QYXVzZUpvYlJlcXVlc3QaDi5mYXRob20udjEuSm9iEjgKCVJlc3VtZUpvYhIbLmZhdGhvbS52MS5SZXN1bWVKb2JSZXF1ZXN0Gg4uZmF0aG9tLnYxLkpvYhI2CghSZXRyeUpvYhIaLmZhdGhvbS52MS5SZXRyeUpvYlJlcXVlc3QaDi5mYXRob20udjEuSm9iEjgKCVVwZGF0ZUpvYhIbLmZhdGhvbS52MS5VcGRhdGVKb2JSZXF1ZXN0Gg4uZmF0aG9tLnYxLkpvYhJGCglEZWxldGVKb2ISGy5mYXRob20udjEuRGVsZXRlSm9iUmVxdWVzdBocLmZhdGhvbS52MS5EZWxldGVKb2JSZXNwb25zZRJBCgpTdHJlYW1Mb2dzEhwuZmF0aG9tLnYxLlN0cmVhbUxvZ3NSZXF1ZXN0GhMuZmF0aG9tLnYxLkxvZ0VudHJ5MAESPgoKR2V0SGlzdG9yeRIcLmZhdGhvbS52MS5HZXRIaXN0b3J5UmVxdWVzdBoSLmZhdGhvbS52MS5IaXN0b3J5EkMKCFNoYXJlSm9iEhouZmF0aG9tLnYxLlNoYXJlSm9iUmVxdWVzdBobLmZhdGhvbS52MS5TaGFyZUpvYlJlc3BvbnNlElIKDUxpc3RBcnRpZmFjdHMSHy5mYXRob20udjEuTGlzdEFydGlmYWN0c1JlcXVlc3QaIC5mYXRob20udjEuTGlzdEFydGlmYWN0c1Jlc3BvbnNlYgZwcm90bzM", [file_fathom_v1_blob, file_fathom_v1_log, file_google_protobuf_timestamp]);
 
 /**
  * A submitted scene.
@@ -74,9 +74,10 @@ export type CreateJobRequest = Message<"fathom.v1.CreateJobRequest"> & {
   maxParallel: number;
 
   /**
-   * The dataset of the job: one of the caller's tenant, committed. It must contain all files that the
-   * manifest names. Without `manifest`, its file "manifest.json" is the manifest. The dataset stays until the
-   * job is deleted. Empty: none.
+   * The dataset of the job: one of the caller's tenant, committed. It must contain all photographs and masks
+   * that the manifest names. Without `manifest`, its file "manifest.json" is the manifest; without that file,
+   * the coordinator reads the scene as InspectDataset does. The dataset stays until the job is deleted.
+   * Empty: none.
    *
    * @generated from field: string dataset_id = 8;
    */
@@ -987,6 +988,14 @@ export type Task = Message<"fathom.v1.Task"> & {
    * @generated from field: string second_worker = 15;
    */
   secondWorker: string;
+
+  /**
+   * The Gaussians that it made, a PLY: the coarse model, those of a partition, or the model of the whole
+   * scene. Absent before they are there, and for stages that make none.
+   *
+   * @generated from field: fathom.v1.BlobRef model = 16;
+   */
+  model?: BlobRef | undefined;
 };
 
 /**
@@ -1051,6 +1060,20 @@ export type Progress = Message<"fathom.v1.Progress"> & {
    * @generated from field: uint64 memory_bytes = 7;
    */
   memoryBytes: bigint;
+
+  /**
+   * The water that it trains, as it is now. Only in History; absent where there is none.
+   *
+   * @generated from field: fathom.v1.WaterNow water = 8;
+   */
+  water?: WaterNow | undefined;
+
+  /**
+   * Where the time of the attempt went. Only in History; absent if unknown.
+   *
+   * @generated from field: fathom.v1.TimeSpent time_spent = 9;
+   */
+  timeSpent?: TimeSpent | undefined;
 };
 
 /**
@@ -1059,6 +1082,132 @@ export type Progress = Message<"fathom.v1.Progress"> & {
  */
 export const ProgressSchema: GenMessage<Progress> = /*@__PURE__*/
   messageDesc(file_fathom_v1_job, 24);
+
+/**
+ * Water parameters during training.
+ *
+ * @generated from message fathom.v1.WaterNow
+ */
+export type WaterNow = Message<"fathom.v1.WaterNow"> & {
+  /**
+   * Attenuation of the direct signal, 1/scene unit.
+   *
+   * @generated from field: fathom.v1.Rgb beta_d = 1;
+   */
+  betaD?: Rgb | undefined;
+
+  /**
+   * Growth of the backscatter, 1/scene unit.
+   *
+   * @generated from field: fathom.v1.Rgb beta_b = 2;
+   */
+  betaB?: Rgb | undefined;
+
+  /**
+   * Colour of the water at infinity, linear light.
+   *
+   * @generated from field: fathom.v1.Rgb b_inf = 3;
+   */
+  bInf?: Rgb | undefined;
+};
+
+/**
+ * Describes the message fathom.v1.WaterNow.
+ * Use `create(WaterNowSchema)` to create a new message.
+ */
+export const WaterNowSchema: GenMessage<WaterNow> = /*@__PURE__*/
+  messageDesc(file_fathom_v1_job, 25);
+
+/**
+ * A number for each colour channel.
+ *
+ * @generated from message fathom.v1.Rgb
+ */
+export type Rgb = Message<"fathom.v1.Rgb"> & {
+  /**
+   * Red.
+   *
+   * @generated from field: float red = 1;
+   */
+  red: number;
+
+  /**
+   * Green.
+   *
+   * @generated from field: float green = 2;
+   */
+  green: number;
+
+  /**
+   * Blue.
+   *
+   * @generated from field: float blue = 3;
+   */
+  blue: number;
+};
+
+/**
+ * Describes the message fathom.v1.Rgb.
+ * Use `create(RgbSchema)` to create a new message.
+ */
+export const RgbSchema: GenMessage<Rgb> = /*@__PURE__*/
+  messageDesc(file_fathom_v1_job, 26);
+
+/**
+ * Where the time of an attempt went, in seconds since its claim.
+ *
+ * @generated from message fathom.v1.TimeSpent
+ */
+export type TimeSpent = Message<"fathom.v1.TimeSpent"> & {
+  /**
+   * All.
+   *
+   * @generated from field: float seconds = 1;
+   */
+  seconds: number;
+
+  /**
+   * The worker fetched its input from the coordinator, before training.
+   *
+   * @generated from field: float fetching_seconds = 2;
+   */
+  fetchingSeconds: number;
+
+  /**
+   * Training ran on the GPU, or prepared work for it.
+   *
+   * @generated from field: float training_seconds = 3;
+   */
+  trainingSeconds: number;
+
+  /**
+   * Training waited for photographs that were not read yet.
+   *
+   * @generated from field: float photographs_seconds = 4;
+   */
+  photographsSeconds: number;
+
+  /**
+   * Held-out views were measured, previews rendered, checkpoints taken.
+   *
+   * @generated from field: float watching_seconds = 5;
+   */
+  watchingSeconds: number;
+
+  /**
+   * The worker sent its result, and waited until it was stored. 0 until then.
+   *
+   * @generated from field: float sending_seconds = 6;
+   */
+  sendingSeconds: number;
+};
+
+/**
+ * Describes the message fathom.v1.TimeSpent.
+ * Use `create(TimeSpentSchema)` to create a new message.
+ */
+export const TimeSpentSchema: GenMessage<TimeSpent> = /*@__PURE__*/
+  messageDesc(file_fathom_v1_job, 27);
 
 /**
  * Metrics on held-out views during training.
@@ -1100,7 +1249,7 @@ export type HeldOutMetrics = Message<"fathom.v1.HeldOutMetrics"> & {
  * Use `create(HeldOutMetricsSchema)` to create a new message.
  */
 export const HeldOutMetricsSchema: GenMessage<HeldOutMetrics> = /*@__PURE__*/
-  messageDesc(file_fathom_v1_job, 25);
+  messageDesc(file_fathom_v1_job, 28);
 
 /**
  * An event of a job.
@@ -1207,7 +1356,7 @@ export type JobEvent = Message<"fathom.v1.JobEvent"> & {
  * Use `create(JobEventSchema)` to create a new message.
  */
 export const JobEventSchema: GenMessage<JobEvent> = /*@__PURE__*/
-  messageDesc(file_fathom_v1_job, 26);
+  messageDesc(file_fathom_v1_job, 29);
 
 /**
  * The settings of a job were changed while it ran.
@@ -1235,7 +1384,7 @@ export type JobUpdated = Message<"fathom.v1.JobUpdated"> & {
  * Use `create(JobUpdatedSchema)` to create a new message.
  */
 export const JobUpdatedSchema: GenMessage<JobUpdated> = /*@__PURE__*/
-  messageDesc(file_fathom_v1_job, 27);
+  messageDesc(file_fathom_v1_job, 30);
 
 /**
  * The job was created, paused, resumed, retried, or ended.
@@ -1263,7 +1412,7 @@ export type JobStateChanged = Message<"fathom.v1.JobStateChanged"> & {
  * Use `create(JobStateChangedSchema)` to create a new message.
  */
 export const JobStateChangedSchema: GenMessage<JobStateChanged> = /*@__PURE__*/
-  messageDesc(file_fathom_v1_job, 28);
+  messageDesc(file_fathom_v1_job, 31);
 
 /**
  * The job entered another stage.
@@ -1291,7 +1440,7 @@ export type JobStageChanged = Message<"fathom.v1.JobStageChanged"> & {
  * Use `create(JobStageChangedSchema)` to create a new message.
  */
 export const JobStageChangedSchema: GenMessage<JobStageChanged> = /*@__PURE__*/
-  messageDesc(file_fathom_v1_job, 29);
+  messageDesc(file_fathom_v1_job, 32);
 
 /**
  * A task changed its state.
@@ -1354,7 +1503,7 @@ export type TaskChanged = Message<"fathom.v1.TaskChanged"> & {
  * Use `create(TaskChangedSchema)` to create a new message.
  */
 export const TaskChangedSchema: GenMessage<TaskChanged> = /*@__PURE__*/
-  messageDesc(file_fathom_v1_job, 30);
+  messageDesc(file_fathom_v1_job, 33);
 
 /**
  * A worker reported progress.
@@ -1389,7 +1538,7 @@ export type TaskProgress = Message<"fathom.v1.TaskProgress"> & {
  * Use `create(TaskProgressSchema)` to create a new message.
  */
 export const TaskProgressSchema: GenMessage<TaskProgress> = /*@__PURE__*/
-  messageDesc(file_fathom_v1_job, 31);
+  messageDesc(file_fathom_v1_job, 34);
 
 /**
  * A checkpoint is durable.
@@ -1424,7 +1573,7 @@ export type TaskCheckpointed = Message<"fathom.v1.TaskCheckpointed"> & {
  * Use `create(TaskCheckpointedSchema)` to create a new message.
  */
 export const TaskCheckpointedSchema: GenMessage<TaskCheckpointed> = /*@__PURE__*/
-  messageDesc(file_fathom_v1_job, 32);
+  messageDesc(file_fathom_v1_job, 35);
 
 /**
  * A warning for the user.
@@ -1445,7 +1594,7 @@ export type Warning = Message<"fathom.v1.Warning"> & {
  * Use `create(WarningSchema)` to create a new message.
  */
 export const WarningSchema: GenMessage<Warning> = /*@__PURE__*/
-  messageDesc(file_fathom_v1_job, 33);
+  messageDesc(file_fathom_v1_job, 36);
 
 /**
  * The stream is alive.
@@ -1460,7 +1609,7 @@ export type KeepAlive = Message<"fathom.v1.KeepAlive"> & {
  * Use `create(KeepAliveSchema)` to create a new message.
  */
 export const KeepAliveSchema: GenMessage<KeepAlive> = /*@__PURE__*/
-  messageDesc(file_fathom_v1_job, 34);
+  messageDesc(file_fathom_v1_job, 37);
 
 /**
  * State of a job.
@@ -1722,6 +1871,7 @@ export const TaskStateSchema: GenEnum<TaskState> = /*@__PURE__*/
  * - REQUEST_ID_REUSED (ALREADY_EXISTS; an earlier call had this id and another body).
  * - BLOB_NOT_FOUND (FAILED_PRECONDITION at CreateJob: first upload the manifest and all files that it names).
  * - DATASET_NOT_FOUND (NOT_FOUND) and DATASET_NOT_COMMITTED (FAILED_PRECONDITION).
+ * - BAD_SCENE (FAILED_PRECONDITION at CreateJob: the dataset has no manifest, and no scene to train on).
  * - LOW_DISK_SPACE (RESOURCE_EXHAUSTED).
  * - STORE_FAILED (UNAVAILABLE; nothing was acknowledged, repeat the call).
  * - JOB_ENDED (FAILED_PRECONDITION; an ended job cannot be paused, resumed or changed).

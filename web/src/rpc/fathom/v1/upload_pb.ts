@@ -14,7 +14,7 @@ import type { Message, UnknownEnum } from "@bufbuild/protobuf";
  * Describes the file fathom/v1/upload.proto.
  */
 export const file_fathom_v1_upload: GenFile = /*@__PURE__*/
-  fileDesc("ChZmYXRob20vdjEvdXBsb2FkLnByb3RvEglmYXRob20udjEiTAoXRmluZE1pc3NpbmdCbG9ic1JlcXVlc3QSIQoFYmxvYnMYASADKAsyEi5mYXRob20udjEuQmxvYlJlZhIOCgZqb2JfaWQYAiABKAkiPwoYRmluZE1pc3NpbmdCbG9ic1Jlc3BvbnNlEiMKB21pc3NpbmcYASADKAsyEi5mYXRob20udjEuQmxvYlJlZiJ4ChBXcml0ZUJsb2JSZXF1ZXN0EiAKBGJsb2IYASABKAsyEi5mYXRob20udjEuQmxvYlJlZhIUCgxvZmZzZXRfYnl0ZXMYAiABKAQSDAoEZGF0YRgDIAEoDBIOCgZmaW5pc2gYBCABKAgSDgoGam9iX2lkGAUgASgJIkMKEVdyaXRlQmxvYlJlc3BvbnNlEhwKFGNvbW1pdHRlZF9zaXplX2J5dGVzGAEgASgEEhAKCGNvbXBsZXRlGAIgASgIIkQKEFF1ZXJ5QmxvYlJlcXVlc3QSIAoEYmxvYhgBIAEoCzISLmZhdGhvbS52MS5CbG9iUmVmEg4KBmpvYl9pZBgCIAEoCSJTChFRdWVyeUJsb2JSZXNwb25zZRIcChRjb21taXR0ZWRfc2l6ZV9ieXRlcxgBIAEoBBIQCghjb21wbGV0ZRgCIAEoCBIOCgZkaXJlY3QYAyABKAgibAoQU2lnbldyaXRlUmVxdWVzdBIgCgRibG9iGAEgASgLMhIuZmF0aG9tLnYxLkJsb2JSZWYSDgoGam9iX2lkGAIgASgJEhQKDG9mZnNldF9ieXRlcxgDIAEoBBIQCghpbl9wYXJ0cxgEIAEoCCLCAQoRU2lnbldyaXRlUmVzcG9uc2USEAoIY29tcGxldGUYASABKAgSCwoDdXJsGAIgASgJEjoKB2hlYWRlcnMYAyADKAsyKS5mYXRob20udjEuU2lnbldyaXRlUmVzcG9uc2UuSGVhZGVyc0VudHJ5Eg4KBnVwbG9hZBgEIAEoCRISCgpzaXplX2J5dGVzGAUgASgEGi4KDEhlYWRlcnNFbnRyeRILCgNrZXkYASABKAkSDQoFdmFsdWUYAiABKAk6AjgBImwKEkZpbmlzaFdyaXRlUmVxdWVzdBIgCgRibG9iGAEgASgLMhIuZmF0aG9tLnYxLkJsb2JSZWYSDgoGdXBsb2FkGAIgASgJEg4KBmpvYl9pZBgDIAEoCRIUCgxvZmZzZXRfYnl0ZXMYBCABKAQiFQoTRmluaXNoV3JpdGVSZXNwb25zZSJXCg9SZWFkQmxvYlJlcXVlc3QSDgoGZGlnZXN0GAEgASgJEhQKDG9mZnNldF9ieXRlcxgCIAEoBBIOCgZqb2JfaWQYAyABKAkSDgoGZGlyZWN0GAQgASgIIlcKEFJlYWRCbG9iUmVzcG9uc2USFAoMb2Zmc2V0X2J5dGVzGAEgASgEEhIKCnNpemVfYnl0ZXMYAiABKAQSDAoEZGF0YRgDIAEoDBILCgN1cmwYBCABKAkirQIKB0RhdGFzZXQSEgoKZGF0YXNldF9pZBgBIAEoCRImCgVzdGF0ZRgCIAEoDjIXLmZhdGhvbS52MS5EYXRhc2V0U3RhdGUSIAoEcm9vdBgDIAEoCzISLmZhdGhvbS52MS5CbG9iUmVmEg0KBWZpbGVzGAQgASgEEhIKCnNpemVfYnl0ZXMYBSABKAQSLwoLY3JlYXRlX3RpbWUYBiABKAsyGi5nb29nbGUucHJvdG9idWYuVGltZXN0YW1wEi8KC2NvbW1pdF90aW1lGAcgASgLMhouZ29vZ2xlLnByb3RvYnVmLlRpbWVzdGFtcBIvCgtleHBpcmVfdGltZRgIIAEoCzIaLmdvb2dsZS5wcm90b2J1Zi5UaW1lc3RhbXASDgoGdGVuYW50GAkgASgJIj0KC0RhdGFzZXRGaWxlEgwKBHBhdGgYASABKAkSIAoEYmxvYhgCIAEoCzISLmZhdGhvbS52MS5CbG9iUmVmIoUBChJCZWdpblVwbG9hZFJlcXVlc3QSEgoKZGF0YXNldF9pZBgBIAEoCRISCgpyZXF1ZXN0X2lkGAIgASgJEiUKBWZpbGVzGAMgAygLMhYuZmF0aG9tLnYxLkRhdGFzZXRGaWxlEiAKBGxpc3QYBCABKAsyEi5mYXRob20udjEuQmxvYlJlZiJ2ChNCZWdpblVwbG9hZFJlc3BvbnNlEiMKB2RhdGFzZXQYASABKAsyEi5mYXRob20udjEuRGF0YXNldBIjCgdtaXNzaW5nGAIgAygLMhIuZmF0aG9tLnYxLkJsb2JSZWYSFQoNbWlzc2luZ19jb3VudBgDIAEoBCIqChRDb21taXREYXRhc2V0UmVxdWVzdBISCgpkYXRhc2V0X2lkGAEgASgJIicKEUdldERhdGFzZXRSZXF1ZXN0EhIKCmRhdGFzZXRfaWQYASABKAkiPAoTTGlzdERhdGFzZXRzUmVxdWVzdBIRCglwYWdlX3NpemUYASABKA0SEgoKcGFnZV90b2tlbhgCIAEoCSJVChRMaXN0RGF0YXNldHNSZXNwb25zZRIkCghkYXRhc2V0cxgBIAMoCzISLmZhdGhvbS52MS5EYXRhc2V0EhcKD25leHRfcGFnZV90b2tlbhgCIAEoCSIqChREZWxldGVEYXRhc2V0UmVxdWVzdBISCgpkYXRhc2V0X2lkGAEgASgJIhcKFURlbGV0ZURhdGFzZXRSZXNwb25zZSpnCgxEYXRhc2V0U3RhdGUSHQoZREFUQVNFVF9TVEFURV9VTlNQRUNJRklFRBAAEhsKF0RBVEFTRVRfU1RBVEVfVVBMT0FESU5HEAESGwoXREFUQVNFVF9TVEFURV9DT01NSVRURUQQAjKdBwoNVXBsb2FkU2VydmljZRJbChBGaW5kTWlzc2luZ0Jsb2JzEiIuZmF0aG9tLnYxLkZpbmRNaXNzaW5nQmxvYnNSZXF1ZXN0GiMuZmF0aG9tLnYxLkZpbmRNaXNzaW5nQmxvYnNSZXNwb25zZRJICglXcml0ZUJsb2ISGy5mYXRob20udjEuV3JpdGVCbG9iUmVxdWVzdBocLmZhdGhvbS52MS5Xcml0ZUJsb2JSZXNwb25zZSgBEkcKCldyaXRlQ2h1bmsSGy5mYXRob20udjEuV3JpdGVCbG9iUmVxdWVzdBocLmZhdGhvbS52MS5Xcml0ZUJsb2JSZXNwb25zZRJGCglRdWVyeUJsb2ISGy5mYXRob20udjEuUXVlcnlCbG9iUmVxdWVzdBocLmZhdGhvbS52MS5RdWVyeUJsb2JSZXNwb25zZRJGCglTaWduV3JpdGUSGy5mYXRob20udjEuU2lnbldyaXRlUmVxdWVzdBocLmZhdGhvbS52MS5TaWduV3JpdGVSZXNwb25zZRJMCgtGaW5pc2hXcml0ZRIdLmZhdGhvbS52MS5GaW5pc2hXcml0ZVJlcXVlc3QaHi5mYXRob20udjEuRmluaXNoV3JpdGVSZXNwb25zZRJFCghSZWFkQmxvYhIaLmZhdGhvbS52MS5SZWFkQmxvYlJlcXVlc3QaGy5mYXRob20udjEuUmVhZEJsb2JSZXNwb25zZTABEkwKC0JlZ2luVXBsb2FkEh0uZmF0aG9tLnYxLkJlZ2luVXBsb2FkUmVxdWVzdBoeLmZhdGhvbS52MS5CZWdpblVwbG9hZFJlc3BvbnNlEkQKDUNvbW1pdERhdGFzZXQSHy5mYXRob20udjEuQ29tbWl0RGF0YXNldFJlcXVlc3QaEi5mYXRob20udjEuRGF0YXNldBI+CgpHZXREYXRhc2V0EhwuZmF0aG9tLnYxLkdldERhdGFzZXRSZXF1ZXN0GhIuZmF0aG9tLnYxLkRhdGFzZXQSTwoMTGlzdERhdGFzZXRzEh4uZmF0aG9tLnYxLkxpc3REYXRhc2V0c1JlcXVlc3QaHy5mYXRob20udjEuTGlzdERhdGFzZXRzUmVzcG9uc2USUgoNRGVsZXRlRGF0YXNldBIfLmZhdGhvbS52MS5EZWxldGVEYXRhc2V0UmVxdWVzdBogLmZhdGhvbS52MS5EZWxldGVEYXRhc2V0UmVzcG9uc2ViBnByb3RvMw", [file_fathom_v1_blob, file_google_protobuf_timestamp]);
+  fileDesc("ChZmYXRob20vdjEvdXBsb2FkLnByb3RvEglmYXRob20udjEiTAoXRmluZE1pc3NpbmdCbG9ic1JlcXVlc3QSIQoFYmxvYnMYASADKAsyEi5mYXRob20udjEuQmxvYlJlZhIOCgZqb2JfaWQYAiABKAkiPwoYRmluZE1pc3NpbmdCbG9ic1Jlc3BvbnNlEiMKB21pc3NpbmcYASADKAsyEi5mYXRob20udjEuQmxvYlJlZiJ4ChBXcml0ZUJsb2JSZXF1ZXN0EiAKBGJsb2IYASABKAsyEi5mYXRob20udjEuQmxvYlJlZhIUCgxvZmZzZXRfYnl0ZXMYAiABKAQSDAoEZGF0YRgDIAEoDBIOCgZmaW5pc2gYBCABKAgSDgoGam9iX2lkGAUgASgJIkMKEVdyaXRlQmxvYlJlc3BvbnNlEhwKFGNvbW1pdHRlZF9zaXplX2J5dGVzGAEgASgEEhAKCGNvbXBsZXRlGAIgASgIIkQKEFF1ZXJ5QmxvYlJlcXVlc3QSIAoEYmxvYhgBIAEoCzISLmZhdGhvbS52MS5CbG9iUmVmEg4KBmpvYl9pZBgCIAEoCSJTChFRdWVyeUJsb2JSZXNwb25zZRIcChRjb21taXR0ZWRfc2l6ZV9ieXRlcxgBIAEoBBIQCghjb21wbGV0ZRgCIAEoCBIOCgZkaXJlY3QYAyABKAgibAoQU2lnbldyaXRlUmVxdWVzdBIgCgRibG9iGAEgASgLMhIuZmF0aG9tLnYxLkJsb2JSZWYSDgoGam9iX2lkGAIgASgJEhQKDG9mZnNldF9ieXRlcxgDIAEoBBIQCghpbl9wYXJ0cxgEIAEoCCLCAQoRU2lnbldyaXRlUmVzcG9uc2USEAoIY29tcGxldGUYASABKAgSCwoDdXJsGAIgASgJEjoKB2hlYWRlcnMYAyADKAsyKS5mYXRob20udjEuU2lnbldyaXRlUmVzcG9uc2UuSGVhZGVyc0VudHJ5Eg4KBnVwbG9hZBgEIAEoCRISCgpzaXplX2J5dGVzGAUgASgEGi4KDEhlYWRlcnNFbnRyeRILCgNrZXkYASABKAkSDQoFdmFsdWUYAiABKAk6AjgBImwKEkZpbmlzaFdyaXRlUmVxdWVzdBIgCgRibG9iGAEgASgLMhIuZmF0aG9tLnYxLkJsb2JSZWYSDgoGdXBsb2FkGAIgASgJEg4KBmpvYl9pZBgDIAEoCRIUCgxvZmZzZXRfYnl0ZXMYBCABKAQiFQoTRmluaXNoV3JpdGVSZXNwb25zZSJXCg9SZWFkQmxvYlJlcXVlc3QSDgoGZGlnZXN0GAEgASgJEhQKDG9mZnNldF9ieXRlcxgCIAEoBBIOCgZqb2JfaWQYAyABKAkSDgoGZGlyZWN0GAQgASgIIlcKEFJlYWRCbG9iUmVzcG9uc2USFAoMb2Zmc2V0X2J5dGVzGAEgASgEEhIKCnNpemVfYnl0ZXMYAiABKAQSDAoEZGF0YRgDIAEoDBILCgN1cmwYBCABKAkirQIKB0RhdGFzZXQSEgoKZGF0YXNldF9pZBgBIAEoCRImCgVzdGF0ZRgCIAEoDjIXLmZhdGhvbS52MS5EYXRhc2V0U3RhdGUSIAoEcm9vdBgDIAEoCzISLmZhdGhvbS52MS5CbG9iUmVmEg0KBWZpbGVzGAQgASgEEhIKCnNpemVfYnl0ZXMYBSABKAQSLwoLY3JlYXRlX3RpbWUYBiABKAsyGi5nb29nbGUucHJvdG9idWYuVGltZXN0YW1wEi8KC2NvbW1pdF90aW1lGAcgASgLMhouZ29vZ2xlLnByb3RvYnVmLlRpbWVzdGFtcBIvCgtleHBpcmVfdGltZRgIIAEoCzIaLmdvb2dsZS5wcm90b2J1Zi5UaW1lc3RhbXASDgoGdGVuYW50GAkgASgJIj0KC0RhdGFzZXRGaWxlEgwKBHBhdGgYASABKAkSIAoEYmxvYhgCIAEoCzISLmZhdGhvbS52MS5CbG9iUmVmIoUBChJCZWdpblVwbG9hZFJlcXVlc3QSEgoKZGF0YXNldF9pZBgBIAEoCRISCgpyZXF1ZXN0X2lkGAIgASgJEiUKBWZpbGVzGAMgAygLMhYuZmF0aG9tLnYxLkRhdGFzZXRGaWxlEiAKBGxpc3QYBCABKAsyEi5mYXRob20udjEuQmxvYlJlZiJ2ChNCZWdpblVwbG9hZFJlc3BvbnNlEiMKB2RhdGFzZXQYASABKAsyEi5mYXRob20udjEuRGF0YXNldBIjCgdtaXNzaW5nGAIgAygLMhIuZmF0aG9tLnYxLkJsb2JSZWYSFQoNbWlzc2luZ19jb3VudBgDIAEoBCIqChRDb21taXREYXRhc2V0UmVxdWVzdBISCgpkYXRhc2V0X2lkGAEgASgJIicKEUdldERhdGFzZXRSZXF1ZXN0EhIKCmRhdGFzZXRfaWQYASABKAkiPAoTTGlzdERhdGFzZXRzUmVxdWVzdBIRCglwYWdlX3NpemUYASABKA0SEgoKcGFnZV90b2tlbhgCIAEoCSJVChRMaXN0RGF0YXNldHNSZXNwb25zZRIkCghkYXRhc2V0cxgBIAMoCzISLmZhdGhvbS52MS5EYXRhc2V0EhcKD25leHRfcGFnZV90b2tlbhgCIAEoCSJAChVJbnNwZWN0RGF0YXNldFJlcXVlc3QSEgoKZGF0YXNldF9pZBgBIAEoCRITCgtjb25maWdfanNvbhgCIAEoCSL7AQoKSW5zcGVjdGlvbhIOCgZzb3VyY2UYASABKAkSDQoFdmlld3MYAiABKA0SDQoFbWFza3MYAyABKA0SEAoIaGVsZF9vdXQYBCABKA0SDwoHY2FtZXJhcxgFIAEoDRIOCgZwb2ludHMYBiABKA0SEgoKcGFydGl0aW9ucxgHIAEoDRIQCgh3YXJuaW5ncxgIIAMoCRIgCgRwbGFuGAkgASgLMhIuZmF0aG9tLnYxLkJsb2JSZWYSJAoIbWFuaWZlc3QYCiABKAsyEi5mYXRob20udjEuQmxvYlJlZhITCgZ1bnNlZW4YCyABKAFIAIgBAUIJCgdfdW5zZWVuIioKFERlbGV0ZURhdGFzZXRSZXF1ZXN0EhIKCmRhdGFzZXRfaWQYASABKAkiFwoVRGVsZXRlRGF0YXNldFJlc3BvbnNlKmcKDERhdGFzZXRTdGF0ZRIdChlEQVRBU0VUX1NUQVRFX1VOU1BFQ0lGSUVEEAASGwoXREFUQVNFVF9TVEFURV9VUExPQURJTkcQARIbChdEQVRBU0VUX1NUQVRFX0NPTU1JVFRFRBACMugHCg1VcGxvYWRTZXJ2aWNlElsKEEZpbmRNaXNzaW5nQmxvYnMSIi5mYXRob20udjEuRmluZE1pc3NpbmdCbG9ic1JlcXVlc3QaIy5mYXRob20udjEuRmluZE1pc3NpbmdCbG9ic1Jlc3BvbnNlEkgKCVdyaXRlQmxvYhIbLmZhdGhvbS52MS5Xcml0ZUJsb2JSZXF1ZXN0GhwuZmF0aG9tLnYxLldyaXRlQmxvYlJlc3BvbnNlKAESRwoKV3JpdGVDaHVuaxIbLmZhdGhvbS52MS5Xcml0ZUJsb2JSZXF1ZXN0GhwuZmF0aG9tLnYxLldyaXRlQmxvYlJlc3BvbnNlEkYKCVF1ZXJ5QmxvYhIbLmZhdGhvbS52MS5RdWVyeUJsb2JSZXF1ZXN0GhwuZmF0aG9tLnYxLlF1ZXJ5QmxvYlJlc3BvbnNlEkYKCVNpZ25Xcml0ZRIbLmZhdGhvbS52MS5TaWduV3JpdGVSZXF1ZXN0GhwuZmF0aG9tLnYxLlNpZ25Xcml0ZVJlc3BvbnNlEkwKC0ZpbmlzaFdyaXRlEh0uZmF0aG9tLnYxLkZpbmlzaFdyaXRlUmVxdWVzdBoeLmZhdGhvbS52MS5GaW5pc2hXcml0ZVJlc3BvbnNlEkUKCFJlYWRCbG9iEhouZmF0aG9tLnYxLlJlYWRCbG9iUmVxdWVzdBobLmZhdGhvbS52MS5SZWFkQmxvYlJlc3BvbnNlMAESTAoLQmVnaW5VcGxvYWQSHS5mYXRob20udjEuQmVnaW5VcGxvYWRSZXF1ZXN0Gh4uZmF0aG9tLnYxLkJlZ2luVXBsb2FkUmVzcG9uc2USRAoNQ29tbWl0RGF0YXNldBIfLmZhdGhvbS52MS5Db21taXREYXRhc2V0UmVxdWVzdBoSLmZhdGhvbS52MS5EYXRhc2V0Ej4KCkdldERhdGFzZXQSHC5mYXRob20udjEuR2V0RGF0YXNldFJlcXVlc3QaEi5mYXRob20udjEuRGF0YXNldBJPCgxMaXN0RGF0YXNldHMSHi5mYXRob20udjEuTGlzdERhdGFzZXRzUmVxdWVzdBofLmZhdGhvbS52MS5MaXN0RGF0YXNldHNSZXNwb25zZRJJCg5JbnNwZWN0RGF0YXNldBIgLmZhdGhvbS52MS5JbnNwZWN0RGF0YXNldFJlcXVlc3QaFS5mYXRob20udjEuSW5zcGVjdGlvbhJSCg1EZWxldGVEYXRhc2V0Eh8uZmF0aG9tLnYxLkRlbGV0ZURhdGFzZXRSZXF1ZXN0GiAuZmF0aG9tLnYxLkRlbGV0ZURhdGFzZXRSZXNwb25zZWIGcHJvdG8z", [file_fathom_v1_blob, file_google_protobuf_timestamp]);
 
 /**
  * Asks which blobs are missing.
@@ -735,6 +735,127 @@ export const ListDatasetsResponseSchema: GenMessage<ListDatasetsResponse> = /*@_
   messageDesc(file_fathom_v1_upload, 19);
 
 /**
+ * Asks what is in a dataset.
+ *
+ * @generated from message fathom.v1.InspectDatasetRequest
+ */
+export type InspectDatasetRequest = Message<"fathom.v1.InspectDatasetRequest"> & {
+  /**
+   * Its id.
+   *
+   * @generated from field: string dataset_id = 1;
+   */
+  datasetId: string;
+
+  /**
+   * The settings of the job, as in CreateJobRequest; empty: the defaults.
+   *
+   * @generated from field: string config_json = 2;
+   */
+  configJson: string;
+};
+
+/**
+ * Describes the message fathom.v1.InspectDatasetRequest.
+ * Use `create(InspectDatasetRequestSchema)` to create a new message.
+ */
+export const InspectDatasetRequestSchema: GenMessage<InspectDatasetRequest> = /*@__PURE__*/
+  messageDesc(file_fathom_v1_upload, 20);
+
+/**
+ * A scene and its plan.
+ *
+ * @generated from message fathom.v1.Inspection
+ */
+export type Inspection = Message<"fathom.v1.Inspection"> & {
+  /**
+   * Format of the cameras: "COLMAP binary", "COLMAP text" or "nerfstudio"; of a manifest, what it says.
+   *
+   * @generated from field: string source = 1;
+   */
+  source: string;
+
+  /**
+   * Number of views; each has a photograph.
+   *
+   * @generated from field: uint32 views = 2;
+   */
+  views: number;
+
+  /**
+   * How many of them have a mask.
+   *
+   * @generated from field: uint32 masks = 3;
+   */
+  masks: number;
+
+  /**
+   * How many of them are held out.
+   *
+   * @generated from field: uint32 held_out = 4;
+   */
+  heldOut: number;
+
+  /**
+   * Number of cameras, each with its own lens.
+   *
+   * @generated from field: uint32 cameras = 5;
+   */
+  cameras: number;
+
+  /**
+   * Number of sparse points.
+   *
+   * @generated from field: uint32 points = 6;
+   */
+  points: number;
+
+  /**
+   * Number of partitions.
+   *
+   * @generated from field: uint32 partitions = 7;
+   */
+  partitions: number;
+
+  /**
+   * What was left out, chosen or is unusual; a sentence each.
+   *
+   * @generated from field: repeated string warnings = 8;
+   */
+  warnings: string[];
+
+  /**
+   * The plan (`Plan` as JSON), for the workers that are connected now. Nothing refers to this file, so it is
+   * deleted with other unused files (`keep_unused_hours`).
+   *
+   * @generated from field: fathom.v1.BlobRef plan = 9;
+   */
+  plan?: BlobRef | undefined;
+
+  /**
+   * The manifest, for CreateJobRequest. As for `plan`, unless a job refers to it.
+   *
+   * @generated from field: fathom.v1.BlobRef manifest = 10;
+   */
+  manifest?: BlobRef | undefined;
+
+  /**
+   * Share of the held-out views' area near sparse points that fewer than two training views see, 0 to 1;
+   * absent where nothing is held out.
+   *
+   * @generated from field: optional double unseen = 11;
+   */
+  unseen?: number | undefined;
+};
+
+/**
+ * Describes the message fathom.v1.Inspection.
+ * Use `create(InspectionSchema)` to create a new message.
+ */
+export const InspectionSchema: GenMessage<Inspection> = /*@__PURE__*/
+  messageDesc(file_fathom_v1_upload, 21);
+
+/**
  * Deletes a dataset.
  *
  * @generated from message fathom.v1.DeleteDatasetRequest
@@ -753,7 +874,7 @@ export type DeleteDatasetRequest = Message<"fathom.v1.DeleteDatasetRequest"> & {
  * Use `create(DeleteDatasetRequestSchema)` to create a new message.
  */
 export const DeleteDatasetRequestSchema: GenMessage<DeleteDatasetRequest> = /*@__PURE__*/
-  messageDesc(file_fathom_v1_upload, 20);
+  messageDesc(file_fathom_v1_upload, 22);
 
 /**
  * The dataset is deleted.
@@ -768,7 +889,7 @@ export type DeleteDatasetResponse = Message<"fathom.v1.DeleteDatasetResponse"> &
  * Use `create(DeleteDatasetResponseSchema)` to create a new message.
  */
 export const DeleteDatasetResponseSchema: GenMessage<DeleteDatasetResponse> = /*@__PURE__*/
-  messageDesc(file_fathom_v1_upload, 21);
+  messageDesc(file_fathom_v1_upload, 23);
 
 /**
  * State of a dataset.
@@ -863,7 +984,7 @@ export const DatasetStateSchema: GenEnum<DatasetState> = /*@__PURE__*/
  * - REQUEST_ID_REUSED (ALREADY_EXISTS; an earlier call had this id and another dataset).
  * - DATASET_IN_USE (FAILED_PRECONDITION; a job uses it).
  * - DATASET_NOT_COMMITTED (FAILED_PRECONDITION).
- * - BLOB_NOT_FOUND (FAILED_PRECONDITION at CommitDataset, otherwise NOT_FOUND).
+ * - BLOB_NOT_FOUND (FAILED_PRECONDITION at CommitDataset and InspectDataset, otherwise NOT_FOUND).
  * - WRONG_OFFSET (OUT_OF_RANGE, metadata `committed_size_bytes`).
  * - UPLOAD_NOT_FOUND (NOT_FOUND; from FinishWrite: nothing has arrived in the bucket, or too late).
  * - DIGEST_MISMATCH (DATA_LOSS). From WriteBlob and FinishWrite: what had arrived is deleted. From ReadBlob:
@@ -872,6 +993,7 @@ export const DatasetStateSchema: GenEnum<DatasetState> = /*@__PURE__*/
  * - WRITE_IN_PROGRESS (ABORTED; another stream is writing this blob).
  * - LOW_DISK_SPACE (RESOURCE_EXHAUSTED).
  * - QUOTA_SPENT (RESOURCE_EXHAUSTED; the tenant has reached its limit of bytes).
+ * - BAD_SCENE (FAILED_PRECONDITION; the files of the dataset are not a scene that can be trained on).
  * - JOB_NOT_FOUND (NOT_FOUND).
  * - The reasons of AdminService about tokens.
  *
@@ -997,6 +1119,19 @@ export const UploadService: GenService<{
     methodKind: "unary";
     input: typeof ListDatasetsRequestSchema;
     output: typeof ListDatasetsResponseSchema;
+  },
+  /**
+   * Reads the scene in a committed dataset and plans it: what a job would train on, before one is created.
+   * The files lie in the dataset as in the folder that `fathom train` reads. Their paths stay inside it, and
+   * cameras, poses and points have at most 1 GiB, of which 64 MiB in JSON. The coordinator reads one scene at
+   * a time; a call that waits for two minutes is RATE_LIMITED.
+   *
+   * @generated from rpc fathom.v1.UploadService.InspectDataset
+   */
+  inspectDataset: {
+    methodKind: "unary";
+    input: typeof InspectDatasetRequestSchema;
+    output: typeof InspectionSchema;
   },
   /**
    * Deletes a dataset that no job uses, also one still being uploaded. Its blobs are deleted when nothing

@@ -1,0 +1,56 @@
+// The water of each task while it trains, from the history of the job.
+
+import { timestampMs } from '@bufbuild/protobuf/wkt';
+
+import type { Rgb, Task, TaskHistory } from '../../rpc/fathom/v1/job_pb.ts';
+import type { WaterPoint, WaterSeries } from '../parts/water-points.ts';
+import { stageWord, taskLabel } from '../words.ts';
+
+type Three = readonly [number, number, number];
+
+const three = (rgb: Rgb | undefined): Three | null => {
+    const values: Three | null = rgb === undefined ? null : [rgb.red, rgb.green, rgb.blue];
+    return values !== null && values.every(Number.isFinite) ? values : null;
+};
+
+function pointsOf({ points }: TaskHistory): readonly WaterPoint[] {
+    return points.flatMap(({ progress, attempt, time }) => {
+        const [beta_d, beta_b, b_inf] = [
+            three(progress?.water?.betaD),
+            three(progress?.water?.betaB),
+            three(progress?.water?.bInf),
+        ];
+        if (
+            progress === undefined ||
+            time === undefined ||
+            beta_d === null ||
+            beta_b === null ||
+            b_inf === null
+        ) {
+            return [];
+        }
+        return [{ timeMs: timestampMs(time), attempt, iteration: progress.iteration, beta_d, beta_b, b_inf }];
+    });
+}
+
+/** The tasks that report a water, in the order of the job. */
+export function waterSeriesOf(
+    tasks: readonly Task[],
+    histories: readonly TaskHistory[],
+): readonly WaterSeries[] {
+    const known = new Map(histories.map((history) => [history.taskId, pointsOf(history)]));
+    return tasks.flatMap(({ taskId: task, stage }) => {
+        const points = known.get(task) ?? [];
+        return points.length === 0 ? [] : [{ task, label: taskLabel(task), stage: stageWord(stage), points }];
+    });
+}
+
+/** Whether the settings of a job say that there is no water. */
+export function isInAir(configJson: string): boolean {
+    try {
+        const config = JSON.parse(configJson) as { readonly water?: { readonly medium?: unknown } } | null;
+        return config?.water?.medium === 'none';
+    } catch {
+        return false;
+    }
+}

@@ -1,0 +1,117 @@
+// Takes the pictures of the pages for docs/using: a real service with two workers, a job that has succeeded,
+// one that runs and two that wait.
+//
+//     FATHOM=PROGRAM node test/headless/take-pictures.ts FOLDER
+//
+// About 5 minutes on 2 cores. The pictures show times and measured values, so they differ from run to run.
+
+import { execFileSync } from 'node:child_process';
+import { mkdtempSync, rmSync, writeFileSync } from 'node:fs';
+import { tmpdir } from 'node:os';
+import { join } from 'node:path';
+import type { Locator, Page } from 'playwright-core';
+
+import { launch } from './browser.ts';
+import { type JobJson, Service, serveWith } from './service.ts';
+import { openAs, sleep, until } from './steps.ts';
+
+const FATHOM = process.env['FATHOM'] ?? '';
+const PAGES = process.env['PAGES'] ?? join(import.meta.dirname, '../../dist');
+const [folder] = process.argv.slice(2);
+if (FATHOM === '' || folder === undefined) {
+    throw new Error('FATHOM names the program, and the argument the folder to write to');
+}
+const WIDTH = 1040;
+const HEIGHT = 760;
+/** Around what is shown, pixels. */
+const MARGIN = 16;
+/** Of a picture, bytes: smaller ones lose sharpness that a reader sees. */
+const MOST_BYTES = 80_000;
+const SCALED = ['--max-gaussians', '6000', '--eval-every', '50', '--set', 'train.preview_seconds=2'];
+const SOON_S = 1200;
+
+const work = mkdtempSync(join(tmpdir(), 'fathom-pictures-'));
+const service = await Service.start(FATHOM, work);
+const serving = await serveWith(PAGES, service.webPort);
+const browser = await launch();
+
+/** Writes a page from the top of an element, or its own, to the end of another; as sharp as the limit allows. */
+async function take(page: Page, name: string, last: Locator, first: Locator | null = null): Promise<void> {
+    await page.setViewportSize({ width: WIDTH, height: HEIGHT });
+    await page.evaluate(() => (document.activeElement as HTMLElement | null)?.blur());
+    // Charts and maps take the new size.
+    await sleep(1000);
+    const topOf = (element: Locator): Promise<number> => element.evaluate((one) => one.getBoundingClientRect().top + scrollY);
+    const endOf = (element: Locator): Promise<number> => element.evaluate((one) => one.getBoundingClientRect().bottom + scrollY);
+    const y = first === null ? 0 : (await topOf(first)) - MARGIN;
+    const clip = { x: 0, y, width: WIDTH, height: (await endOf(last)) + MARGIN - y };
+    let bytes: Buffer = Buffer.alloc(0);
+    for (let quality = 90; quality >= 40 && (bytes.length === 0 || bytes.length > MOST_BYTES); quality -= 5) {
+        bytes = await page.screenshot({ type: 'jpeg', quality, fullPage: true, clip });
+    }
+    writeFileSync(join(folder!, `${name}.jpg`), bytes);
+    console.log(`${name}.jpg: ${clip.height} pixels high, ${bytes.length} bytes`);
+}
+
+try {
+    const [wreck, reef] = [join(work, 'wreck'), join(work, 'reef')];
+    execFileSync(FATHOM, ['synth', wreck, '--views', '40', '--size', '320x240'], { stdio: 'ignore' });
+    execFileSync(FATHOM, ['synth', reef, '--views', '40', '--size', '240x180', '--look', 'forward'], { stdio: 'ignore' });
+    const ana = service.token('ana', '--role', 'submitter', '--tenant', 'survey');
+    const worker = service.token('workers', '--role', 'worker');
+    for (const [data, id] of [[wreck, 'wreck-2026'], [reef, 'reef-7']] as const) {
+        service.run(ana, 'dataset', 'upload', data, '--id', id, '--coordinator', service.url);
+    }
+    const submit = (id: string, name: string, ...flags: readonly string[]): string =>
+        service.run(ana, 'submit', '--dataset', id, '--name', name, '--coordinator', service.url, ...SCALED, ...flags).split('\n').at(-1)!;
+    const jobOf = (id: string): Promise<JobJson> => service.api<JobJson>(ana, `jobs/${id}`);
+    ['gpu-1', 'gpu-2'].forEach((name) => service.startWorker(worker, name));
+
+    const slope = submit('reef-7', 'Reef slope', '--partitions', '2x1', '--iterations', '240');
+    await until('the first job succeeds', async () => (await jobOf(slope)).state === 'succeeded', SOON_S);
+    const wreckJob = submit('wreck-2026', 'Wreck, whole', '--partitions', '2x2', '--iterations', '700');
+    submit('wreck-2026', 'Wreck, finer', '--partitions', '4x2', '--iterations', '9000', '--priority', '-5');
+    const paused = submit('reef-7', 'Reef slope, joint water', '--set', 'water.partitions=joint', '--partitions', '2x1');
+    service.run(ana, 'pause', paused, '--reason', 'after the survey of Friday', '--coordinator', service.url);
+
+    const { page } = await openAs(browser, `${serving.address}/#/jobs`, ana, { viewport: { width: WIDTH, height: HEIGHT }, colorScheme: 'light' });
+    const tabs = page.getByRole('navigation', { name: 'Sections of the job' });
+    const show = async (route: string): Promise<void> => {
+        await page.evaluate((hash) => (location.hash = hash), `#/${route}`);
+        await page.locator('.section .loading').waitFor({ state: 'detached' });
+        await sleep(1500);
+    };
+
+    // The new job, before anything has to be waited for.
+    await show('new');
+    await page.getByLabel('Name').fill('Wreck, second survey');
+    await page.getByLabel('Dataset').selectOption('wreck-2026');
+    await take(page, 'new-job', page.locator('main .card').last());
+
+    await show(`jobs/${slope}/water`);
+    await page.getByRole('heading', { name: 'Attenuation of direct light' }).waitFor();
+    await take(page, 'water', page.locator('.section .card').last(), tabs);
+
+    // While it trains: about half of its partitions are done.
+    await until('half of the job', async () => (await jobOf(wreckJob)).progress > 0.45, SOON_S);
+    await show(`jobs/${wreckJob}`);
+    await page.locator('.fp-plan-canvas').waitFor();
+    await take(page, 'job', page.locator('.section .card').first());
+    await take(page, 'stages', page.locator('.fp-time'), page.getByRole('heading', { name: 'Stages' }));
+    await show('jobs');
+    await take(page, 'jobs', page.locator('main .card').last());
+    await show(`jobs/${wreckJob}/curves`);
+    await page.locator('.fp-curves canvas').first().waitFor();
+    await take(page, 'curves', page.locator('.fp-curve-grid'), tabs);
+    await show(`jobs/${wreckJob}/views`);
+    await page.locator('.fp-compare-stage img').first().waitFor();
+    await take(page, 'previews', page.locator('.section .card'), tabs);
+    const operator = await openAs(browser, `${serving.address}/#/service`, service.operator, { viewport: { width: WIDTH, height: HEIGHT }, colorScheme: 'light' });
+    await operator.page.getByRole('row', { name: 'gpu-2' }).waitFor();
+    await take(operator.page, 'service', operator.page.locator('main .card').last());
+} finally {
+    await browser.close();
+    serving.close();
+    await service.stop();
+    rmSync(work, { recursive: true, force: true });
+}

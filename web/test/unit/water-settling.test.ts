@@ -1,0 +1,88 @@
+// The water of tasks while it is trained.
+
+import assert from 'node:assert/strict';
+import { test } from 'node:test';
+
+import { create } from '@bufbuild/protobuf';
+import { timestampFromMs } from '@bufbuild/protobuf/wkt';
+
+import { isInAir, waterSeriesOf } from '../../src/pages/job/water-history.ts';
+import { type WaterSeries, firstShown, spreadOfPartitions } from '../../src/pages/parts/water-points.ts';
+import { Stage, TaskHistorySchema, TaskSchema } from '../../src/rpc/fathom/v1/job_pb.ts';
+
+const series = (task: string, stage: string, ...scales: readonly number[]): WaterSeries => ({
+    task,
+    label: task,
+    stage,
+    points: scales.map((by, at) => ({
+        timeMs: at,
+        attempt: 1,
+        iteration: 100 * at,
+        beta_d: [4 * by, 2 * by, 1 * by],
+        beta_b: [3 * by, 2 * by, 1 * by],
+        b_inf: [0, 0.1, 0.2],
+    })),
+});
+
+test('only points with all nine numbers are kept, by task in the order of the job', () => {
+    const rgb = { red: 1, green: 2, blue: 3 };
+    const time = timestampFromMs(7000);
+    const task = (taskId: string, stage: Stage) => create(TaskSchema, { taskId, stage });
+    const points = [
+        { time, attempt: 2, progress: { iteration: 5, water: { betaD: rgb, betaB: rgb, bInf: rgb } } },
+        { time, attempt: 2, progress: { iteration: 6, water: { betaD: rgb, betaB: rgb } } },
+        { time, attempt: 2, progress: { iteration: 7 } },
+        {
+            time,
+            attempt: 2,
+            progress: { iteration: 8, water: { betaD: rgb, betaB: rgb, bInf: { ...rgb, red: NaN } } },
+        },
+    ];
+    const found = waterSeriesOf(
+        [task('global', Stage.GLOBAL), task('merge', Stage.MERGE), task('partition-0001', Stage.PARTITION)],
+        [
+            create(TaskHistorySchema, { taskId: 'partition-0001', points }),
+            create(TaskHistorySchema, { taskId: 'global', points: points.slice(0, 1) }),
+            create(TaskHistorySchema, { taskId: 'merge' }),
+        ],
+    );
+    const three = [1, 2, 3];
+    const point = { timeMs: 7000, attempt: 2, iteration: 5, beta_d: three, beta_b: three, b_inf: three };
+    assert.deepEqual(found, [
+        { task: 'global', label: 'Coarse model', stage: 'global', points: [point] },
+        { task: 'partition-0001', label: 'Partition 1', stage: 'partition', points: [point] },
+    ]);
+});
+
+test('the first task that trains its water in the last stage that does is shown first', () => {
+    const coarse = series('global', 'global', 1, 2);
+    const fixed = series('partition-0000', 'partition', 2, 2);
+    assert.equal(firstShown([]), null);
+    assert.equal(firstShown([fixed])?.task, 'partition-0000');
+    assert.equal(firstShown([coarse, fixed])?.task, 'global');
+    const parts = [
+        series('first_part-0000', 'first_part', 2, 2),
+        series('first_part-0001', 'first_part', 2, 3),
+    ];
+    assert.equal(firstShown([coarse, ...parts, fixed])?.task, 'first_part-0001');
+});
+
+test('the spread is that of the latest values, and of partitions that differ', () => {
+    const parts = [
+        series('first_part-0000', 'first_part', 9, 1),
+        series('first_part-0001', 'first_part', 1.5),
+    ];
+    const after = [series('partition-0000', 'partition', 1), series('partition-0001', 'partition', 1)];
+    const spread = spreadOfPartitions([series('global', 'global', 5), ...parts, ...after]);
+    assert.equal(spread?.partitions, 2);
+    assert.deepEqual(spread?.of.beta_d[0], { lowest: 4, highest: 6, share: 0.4 });
+    assert.deepEqual(spread?.of.b_inf[0], { lowest: 0, highest: 0, share: null });
+    assert.equal(spreadOfPartitions(after), null, 'all have one water');
+    assert.equal(spreadOfPartitions(parts.slice(1)), null, 'one partition');
+});
+
+test('settings without a medium are known', () => {
+    assert.ok(isInAir('{"water": {"medium": "none"}}'));
+    assert.ok(!isInAir('{"water": {"medium": "per_pixel"}}'));
+    assert.ok(!isInAir(''));
+});
