@@ -86,7 +86,7 @@ try {
     await show('new');
     await page.getByLabel('Name').fill('Wreck, second survey');
     await page.getByLabel('Dataset').selectOption('wreck-2026');
-    await take(page, 'new-job', page.locator('main .card').last());
+    await take(page, 'new-job', page.locator('main .card:visible').first());
 
     await show(`jobs/${slope}/water`);
     await page.getByRole('heading', { name: 'Attenuation of direct light' }).waitFor();
@@ -96,7 +96,7 @@ try {
     await until('half of the job', async () => (await jobOf(wreckJob)).progress > 0.45, SOON_S);
     await show(`jobs/${wreckJob}`);
     await page.locator('.fp-plan-canvas').waitFor();
-    await take(page, 'job', page.locator('.section .card').first());
+    await take(page, 'job', page.locator('.section .card').nth(1));
     await take(page, 'stages', page.locator('.fp-time'), page.getByRole('heading', { name: 'Stages' }));
     await show('jobs');
     await take(page, 'jobs', page.locator('main .card').last());
