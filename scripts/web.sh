@@ -7,6 +7,7 @@
 #     scripts/web.sh headless   the built pages in Chromium beside `fathom render`, before a coordinator and a
 #                               worker, and for an hour of news (quick: two small models, without the hour)
 #     scripts/web.sh pictures   docs/using/*.jpg of the pages, from a service with a small job; look at them
+#     scripts/web.sh cost [N]   CPU time of a job with previews and an open page against one without, N pairs
 #
 # Needs npm and its registry. The packages, with Node as the package `node`, are those of
 # web/package-lock.json; Chromium is that of the system. Exits with 3 where npm or Chromium is missing, so
@@ -109,8 +110,13 @@ case "${1:-}" in
         find_browser
         FATHOM=$fathom node test/headless/take-pictures.ts ../docs/using
         ;;
+    cost)
+        packages
+        find_browser
+        FATHOM=$fathom node test/headless/cost.ts ${2:+"$2"}
+        ;;
     *)
-        sed -n '2,16p' "$self" | sed 's/^# \{0,1\}//'
+        sed -n '2,17p' "$self" | sed 's/^# \{0,1\}//'
         exit 2
         ;;
 esac

@@ -10,8 +10,10 @@ use std::time::Duration;
 
 use tokio::io::{AsyncBufReadExt as _, BufReader};
 use tokio::process::{Child, ChildStdout, Command};
+use tokio::sync::mpsc;
 
 use crate::error::{CliError, Result};
+use crate::output;
 
 /// Flag that makes a service stop when its standard input closes.
 pub const STOP_WITH_PARENT: &str = "--stop-with-stdin";
@@ -60,8 +62,10 @@ pub struct Children {
     coordinator: Process,
     workers: Vec<Process>,
     pub url: String,
-    /// The link to the page that shows the job, if asked for. It contains a token.
+    /// The link to the page that shows the job, if asked for. It can be used once; then the next one arrives.
     pub page: Option<String>,
+    /// The later links.
+    later_pages: mpsc::UnboundedReceiver<String>,
 }
 
 impl Children {
@@ -91,20 +95,27 @@ impl Children {
             arguments.extend(["--web", "127.0.0.1:0", "--own-page"].map(str::to_owned));
         }
         let mut coordinator = Process::start("coordinator".to_owned(), arguments, logs)?;
-        let (url, page) = coordinator.wait_for_url().await?;
+        let (sender, later_pages) = mpsc::unbounded_channel();
+        let (url, page) = coordinator.wait_for_url(sender).await?;
         let mut workers = Vec::new();
         for (index, extra) in worker_arguments.iter().enumerate() {
             let mut arguments = vec!["worker".to_owned(), "--coordinator".to_owned(), url.clone()];
             arguments.extend(extra.iter().cloned());
             workers.push(Process::start(format!("worker-{index}"), arguments, logs)?);
         }
-        Ok(Self { coordinator, workers, url, page })
+        Ok(Self { coordinator, workers, url, page, later_pages })
     }
 
-    /// Waits until a process dies that cannot be replaced; workers are restarted a few times.
+    /// Waits until a process dies that cannot be replaced; workers are restarted a few times. Meanwhile it
+    /// prints the next link to the page whenever one has been used.
     pub async fn failure(&mut self) -> CliError {
         loop {
             tokio::time::sleep(Duration::from_millis(300)).await;
+            while let Ok(page) = self.later_pages.try_recv() {
+                output::remark_over_bar(format!(
+                    "the link to the page has been used; the next one is {page}"
+                ));
+            }
             if let Some(error) = self.coordinator.death() {
                 return error;
             }
@@ -147,8 +158,11 @@ impl Process {
         Ok(())
     }
 
-    /// The URL of a coordinator, and the link to its page.
-    async fn wait_for_url(&mut self) -> Result<(String, Option<String>)> {
+    /// The URL of a coordinator, and the link to its page. Later links go to `later_pages`.
+    async fn wait_for_url(
+        &mut self,
+        later_pages: mpsc::UnboundedSender<String>,
+    ) -> Result<(String, Option<String>)> {
         let stdout: ChildStdout =
             self.child.stdout.take().ok_or_else(|| self.ended("has no output".to_owned()))?;
         let mut lines = BufReader::new(stdout).lines();
@@ -166,7 +180,18 @@ impl Process {
         })
         .await;
         match found {
-            Ok(Some(url)) => Ok((url, page)),
+            Ok(Some(url)) => {
+                tokio::spawn(async move {
+                    while let Ok(Some(line)) = lines.next_line().await {
+                        if let Some(link) = line.strip_prefix(PAGE)
+                            && later_pages.send(link.trim().to_owned()).is_err()
+                        {
+                            return;
+                        }
+                    }
+                });
+                Ok((url, page))
+            }
             Ok(None) => Err(self.ended("ended before it was ready".to_owned())),
             Err(_) => Err(self.ended(format!("was not ready after {} s", START_PATIENCE.as_secs()))),
         }

@@ -5,6 +5,7 @@
 //! output passes through this file, which escapes such characters ([`fathom_observe::shown`]).
 
 use std::fmt::Display;
+use std::io::IsTerminal as _;
 use std::io::Write as _;
 use std::path::Path;
 
@@ -32,6 +33,14 @@ pub fn coloured(text: impl Display) {
 /// Prints lines on stderr, for users who watch.
 pub fn remark(text: impl Display) {
     line_by_line(&text.to_string()).for_each(|text| eprintln!("{}", shown(text)));
+}
+
+/// Prints lines on stderr while a progress bar is there, which is drawn again below them.
+pub fn remark_over_bar(text: impl Display) {
+    if std::io::stderr().is_terminal() {
+        eprint!("\r\x1b[2K");
+    }
+    remark(text);
 }
 
 /// The lines of a text; one empty line if it is empty.

@@ -38,8 +38,8 @@ pub struct CoordinatorConfig {
     /// Where to serve the HTTP interface, with the TLS and the tokens of this coordinator, which it needs
     /// beyond this machine; port 0 takes a free one. Default: nowhere.
     pub web: Option<SocketAddr>,
-    /// Whether `web` requires a token that is made for this process, although `tokens` is false: the page of
-    /// `fathom train` is for the one who started it. See [`crate::Coordinator::page_token`]. No setting of a
+    /// Whether `web` requires a token that only an invitation gives, although `tokens` is false: the page of
+    /// `fathom train` is for the one who started it. See [`crate::Coordinator::invitations`]. No setting of a
     /// file.
     #[serde(skip)]
     pub own_page: bool,

@@ -29,6 +29,9 @@ const MOST_PREVIEWS_IN_MESSAGE: usize = 8;
 const MOST_IN_ANSWER: usize = 12_000;
 const MOST_PREVIEWS_IN_ANSWER: usize = 2000;
 const LEAST_OF_TASK: usize = 12;
+/// Largest picture of a preview that is kept, bytes, as its worker states it: a JPEG of 480 x 480 pixels has
+/// far less. Pages read no further.
+const MAX_PICTURE_BYTES: u64 = 512 << 10;
 /// Longest name of a view that is kept, bytes.
 const MAX_NAME_BYTES: usize = 1024;
 /// Points of a task that wait in memory at most.
@@ -129,12 +132,15 @@ impl Waiting {
 /// Whether a preview has what it needs: a page shows its texts.
 fn is_sound(preview: &v1::Preview) -> bool {
     let is_blob = |blob: &v1::BlobRef| {
-        blob.digest.len() == 64 && blob.digest.bytes().all(|byte| matches!(byte, b'0'..=b'9' | b'a'..=b'f'))
+        blob.size_bytes <= MAX_PICTURE_BYTES
+            && blob.digest.len() == 64
+            && blob.digest.bytes().all(|byte| matches!(byte, b'0'..=b'9' | b'a'..=b'f'))
     };
     preview.view.len() <= MAX_NAME_BYTES
         && !preview.view.contains(char::is_control)
         && preview.render.as_ref().is_some_and(is_blob)
         && preview.clear.as_ref().is_none_or(is_blob)
+        && preview.psnr_db.is_none_or(f64::is_finite)
 }
 
 /// Whether all numbers of a report can be drawn.
@@ -150,6 +156,7 @@ fn is_readable(progress: &v1::Progress) -> bool {
             spent.photographs_seconds,
             spent.watching_seconds,
             spent.sending_seconds,
+            spent.disk_seconds.unwrap_or_default(),
         ]
     });
     progress.iterations_per_second.is_finite()
@@ -424,7 +431,7 @@ mod tests {
 
     fn preview(view: &str, iteration: u32) -> v1::Preview {
         let render = Some(v1::BlobRef { digest: "a".repeat(64), size_bytes: 1 });
-        v1::Preview { view: view.to_owned(), iteration, render, clear: None }
+        v1::Preview { view: view.to_owned(), iteration, render, clear: None, psnr_db: Some(20.0) }
     }
 
     #[test]
@@ -493,12 +500,15 @@ mod tests {
     }
 
     #[test]
-    fn a_preview_with_a_hostile_name_or_digest_is_left_out() {
+    fn a_hostile_preview_is_left_out() {
         assert!(is_sound(&preview("dive/one.png", 1)));
         assert!(!is_sound(&preview("one\u{1b}[2J", 1)) && !is_sound(&preview(&"x".repeat(2000), 1)));
         let digest = v1::BlobRef { digest: "../../x".into(), size_bytes: 1 };
         assert!(!is_sound(&v1::Preview { render: Some(digest.clone()), ..preview("a", 1) }));
         assert!(!is_sound(&v1::Preview { clear: Some(digest), ..preview("a", 1) }));
         assert!(!is_sound(&v1::Preview { render: None, ..preview("a", 1) }));
+        assert!(!is_sound(&v1::Preview { psnr_db: Some(f64::NAN), ..preview("a", 1) }));
+        let large = v1::BlobRef { digest: "a".repeat(64), size_bytes: 1 << 30 };
+        assert!(!is_sound(&v1::Preview { render: Some(large), ..preview("a", 1) }));
     }
 }

@@ -1,13 +1,13 @@
-//! Jobs, events, workers, tenants, datasets and log lines as JSON: what `--json` of the command line prints,
-//! and what the HTTP interface answers.
+//! Jobs, events, workers, tenants, tokens, datasets and log lines as JSON: what `--json` of the command line
+//! prints, and what the HTTP interface answers.
 //!
 //! States are words, times are seconds since 1970 or RFC 3339, and a value that is not known is `null`.
 
-use fathom_proto::admin::v1::{Caller, Role, Tenant, Worker, WorkerState};
+use fathom_proto::admin::v1::{Caller, Role, Tenant, Token, Worker, WorkerState};
 use fathom_proto::v1::job_event::Event;
 use fathom_proto::v1::{
-    Dataset, DatasetState, HeldOutMetrics, HistoryPoint, Job, JobEvent, JobState, LogEntry, LogSeverity,
-    Preview, Rgb, Stage, Task, TaskHistory, TaskState, TimeSpent, WaterNow,
+    Dataset, DatasetState, HeldOutMetrics, HistoryPoint, Inspection, Job, JobEvent, JobState, LogEntry,
+    LogSeverity, Preview, Rgb, Stage, Task, TaskHistory, TaskState, TimeSpent, WaterNow,
 };
 use prost_types::Timestamp;
 use serde_json::{Value, json};
@@ -58,6 +58,7 @@ pub fn job(of: &Job) -> Value {
         "time_left_seconds": of.time_left_seconds,
         "tenant": of.tenant,
         "dataset": (!of.dataset_id.is_empty()).then_some(&of.dataset_id),
+        "plan": of.plan.as_ref().map(|plan| &plan.digest),
         "partitions": of.partitions,
         "priority": of.priority,
         "max_parallel": of.max_parallel,
@@ -172,6 +173,7 @@ pub fn task_history(of: &TaskHistory) -> Value {
             "iteration": of.iteration,
             "render": of.render.as_ref().map(|blob| &blob.digest),
             "clear": of.clear.as_ref().map(|blob| &blob.digest),
+            "psnr": of.psnr_db,
         })
     };
     json!({
@@ -194,6 +196,7 @@ fn time_spent(of: &TimeSpent) -> Value {
         "photographs_seconds": of.photographs_seconds,
         "watching_seconds": of.watching_seconds,
         "sending_seconds": of.sending_seconds,
+        "disk_seconds": of.disk_seconds,
     })
 }
 
@@ -201,19 +204,37 @@ fn held_out(of: &HeldOutMetrics) -> Value {
     json!({"iteration": of.iteration, "psnr": of.psnr_db, "ssim": of.ssim, "views": of.views})
 }
 
-/// The caller of a service.
-pub fn caller(of: &Caller) -> Value {
-    let text = |text: &str| (!text.is_empty()).then(|| text.to_owned());
-    let role = match of.role() {
+/// A role, in a word.
+pub fn role(role: Role) -> &'static str {
+    match role {
         Role::Unspecified => "unknown",
         Role::Viewer => "viewer",
         Role::Submitter => "submitter",
         Role::Operator => "operator",
         Role::Worker => "worker",
-    };
+    }
+}
+
+/// A token, without its secret.
+pub fn token(of: &Token) -> Value {
+    json!({
+        "id": of.token_id,
+        "name": of.name,
+        "role": role(of.role()),
+        "tenant": (!of.tenant.is_empty()).then_some(&of.tenant),
+        "job": (!of.job_id.is_empty()).then_some(&of.job_id),
+        "created_unix_seconds": unix_seconds(&of.create_time),
+        "expires_unix_seconds": unix_seconds(&of.expire_time),
+        "revoked_unix_seconds": unix_seconds(&of.revoke_time),
+    })
+}
+
+/// The caller of a service.
+pub fn caller(of: &Caller) -> Value {
+    let text = |text: &str| (!text.is_empty()).then(|| text.to_owned());
     json!({
         "name": of.name,
-        "role": role,
+        "role": role(of.role()),
         "tenant": text(&of.tenant),
         "job": text(&of.job_id),
         "expires_unix_seconds": unix_seconds(&of.expire_time),
@@ -246,6 +267,9 @@ pub fn worker(of: &Worker) -> Value {
         "memory_bytes": (of.memory_bytes > 0).then_some(of.memory_bytes),
         "version": of.build_version,
         "stages": of.stages().map(stage).collect::<Vec<_>>(),
+        "iterations_per_second": (of.iterations_per_second > 0.0).then_some(of.iterations_per_second),
+        "last_words": (!of.last_words.is_empty()).then_some(&of.last_words),
+        "last_words_unix_seconds": unix_seconds(&of.last_words_time),
         "held": held
             .map(|held| json!({
                 "job": held.job_id,
@@ -270,6 +294,21 @@ pub fn tenant(of: &Tenant) -> Value {
         "max_parallel": limit(quota.max_parallel.into()),
         "max_bytes": limit(quota.max_bytes),
         "own_limits": of.quota_is_own,
+    })
+}
+
+/// What a job would train on.
+pub fn inspection(of: &Inspection) -> Value {
+    json!({
+        "source": of.source,
+        "views": of.views,
+        "masks": of.masks,
+        "held_out": of.held_out,
+        "cameras": of.cameras,
+        "points": of.points,
+        "partitions": of.partitions,
+        "unseen": of.unseen,
+        "warnings": of.warnings,
     })
 }
 

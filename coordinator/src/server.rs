@@ -25,7 +25,7 @@ use tower_layer::Layer;
 use crate::access::calls::OpenCalls;
 use crate::access::guard::{Guard, GuardLayer};
 use crate::access::places::Places;
-use crate::access::{Access, RateLimit, Role, Token, TokenRecord, ensure_operator};
+use crate::access::{Access, RateLimit, Token, ensure_operator};
 use crate::clock::Clock;
 use crate::company::keep_in_touch;
 use crate::config::CoordinatorConfig;
@@ -73,7 +73,7 @@ pub struct Coordinator {
     scheme: &'static str,
     metrics_address: Option<SocketAddr>,
     web_address: Option<SocketAddr>,
-    page_token: Option<Token>,
+    invitations: Option<watch::Receiver<Option<Token>>>,
     scaler_address: Option<SocketAddr>,
     stopping: watch::Sender<bool>,
     running: JoinHandle<Result<(), CoordinatorError>>,
@@ -102,10 +102,9 @@ impl Coordinator {
         self.web_address
     }
 
-    /// The token that the HTTP interface requires although other calls need none
-    /// ([`CoordinatorConfig::own_page`]).
-    pub fn page_token(&self) -> Option<String> {
-        self.page_token.as_ref().map(Token::reveal)
+    /// The invitations to the page of this process ([`CoordinatorConfig::own_page`]): each can be used once.
+    pub fn invitations(&self) -> Option<watch::Receiver<Option<Token>>> {
+        self.invitations.clone()
     }
 
     /// The address of the scaler, if served.
@@ -317,9 +316,9 @@ where
     let connections = Connections::new(room);
 
     let (stopping, stop_signal) = watch::channel(false);
-    let own_page = (config.own_page && !config.tokens).then(|| access_to_own_page(clock.now_ms()));
-    let (page_token, page_guard) =
-        own_page.map(|(token, access)| (token, GuardLayer(Arc::new(guarded_by(&access))))).unzip();
+    let own_page = (config.own_page && !config.tokens).then(|| Arc::new(Access::by_invitation()));
+    let invitations = own_page.as_ref().map(|access| access.invitations());
+    let page_guard = own_page.map(|access| GuardLayer(Arc::new(guarded_by(&access))));
     if let Some(GuardLayer(guard)) = &page_guard {
         let (calls, access, mut ends) =
             (Arc::clone(&guard.calls), Arc::clone(&guard.access), stop_signal.clone());
@@ -406,7 +405,7 @@ where
         address,
         metrics_address,
         web_address,
-        page_token,
+        invitations,
         scaler_address,
         scheme,
         stopping,
@@ -414,13 +413,6 @@ where
         connections,
         shared,
     })
-}
-
-/// A token for the one who starts this process, and what requires it. It is stored nowhere.
-fn access_to_own_page(now_ms: u64) -> (Token, Arc<Access>) {
-    let token = Token::random();
-    let record = TokenRecord::new(&token, "page".to_owned(), Role::Operator, None, now_ms, None);
-    (token, Arc::new(Access::by_tokens(vec![record])))
 }
 
 /// Checks the files of TLS until the coordinator stops.

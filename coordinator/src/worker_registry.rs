@@ -14,6 +14,8 @@ use crate::service_error::ServiceError;
 use crate::store::members::SharedWorker;
 use crate::store::{StoreError, WorkerMark};
 
+/// Longest line that is kept of a worker, characters.
+const MAX_WORDS: usize = 296;
 /// Cache time of [`WorkerRegistry::peers`], milliseconds.
 const PEERS_FOR_MS: u64 = 200;
 
@@ -47,6 +49,15 @@ impl KnownWorker {
     }
 }
 
+/// The beginning of a message, as one line.
+fn short(message: &str) -> String {
+    let line = message.replace(['\n', '\r'], " ");
+    match line.char_indices().nth(MAX_WORDS) {
+        Some((end, _)) => format!("{} ...", &line[..end]),
+        None => line,
+    }
+}
+
 /// All workers that this process knows of.
 pub struct WorkerRegistry {
     clock: Clock,
@@ -58,6 +69,8 @@ pub struct WorkerRegistry {
     called: Mutex<HashSet<String>>,
     /// Marked workers, by incarnation, also stored; and the number of changes by this process.
     marks: Mutex<(HashMap<String, WorkerMark>, u64)>,
+    /// The latest line that a worker logged for a task, and when, by incarnation.
+    last_words: Mutex<HashMap<String, (String, u64)>>,
     /// The cached answer of [`WorkerRegistry::peers`], and its time, Unix milliseconds.
     connected: Mutex<(u64, Arc<[WorkerProfile]>)>,
 }
@@ -66,8 +79,8 @@ impl WorkerRegistry {
     /// An empty registry with the stored marks.
     pub fn new(clock: Clock, lease_ms: u32, marks: HashMap<String, WorkerMark>) -> Self {
         let connected = Mutex::new((0, Arc::default()));
-        let (workers, called) = (Mutex::default(), Mutex::default());
-        Self { clock, lease_ms, workers, called, marks: Mutex::new((marks, 0)), connected }
+        let (workers, called, last_words) = (Mutex::default(), Mutex::default(), Mutex::default());
+        Self { clock, lease_ms, workers, called, marks: Mutex::new((marks, 0)), last_words, connected }
     }
 
     /// Adds a worker that registers; it counts at once.
@@ -116,6 +129,20 @@ impl WorkerRegistry {
             called.insert(incarnation.to_owned());
         }
         Some(worker)
+    }
+
+    /// Notes a line that a worker has logged; of a worker that has not called it notes nothing.
+    pub fn heard(&self, incarnation: &str, line: &str, time_ms: u64) {
+        if self.is_known(incarnation) {
+            let said = (short(line), time_ms);
+            let mut last_words = self.last_words.lock().unwrap_or_else(PoisonError::into_inner);
+            last_words.insert(incarnation.to_owned(), said);
+        }
+    }
+
+    /// The latest line of a worker, and when it logged it, Unix milliseconds.
+    pub fn last_words(&self, incarnation: &str) -> Option<(String, u64)> {
+        self.last_words.lock().unwrap_or_else(PoisonError::into_inner).get(incarnation).cloned()
     }
 
     /// The workers that have called this process since the last question, and how long ago, milliseconds.
@@ -177,6 +204,8 @@ impl WorkerRegistry {
         let limit_ms = self.forget_after_ms();
         let mut workers = self.workers.lock().unwrap_or_else(PoisonError::into_inner);
         workers.retain(|_, worker| now_ms.saturating_sub(worker.seen_ms) <= limit_ms);
+        let mut last_words = self.last_words.lock().unwrap_or_else(PoisonError::into_inner);
+        last_words.retain(|incarnation, _| workers.contains_key(incarnation));
     }
 
     /// Time after which a silent worker is forgotten, milliseconds.

@@ -113,6 +113,15 @@ impl Gaussians {
         surfaces
     }
 
+    /// Makes room for exactly `count` further Gaussians.
+    pub fn reserve(&mut self, count: usize) {
+        self.means.reserve_exact(count);
+        self.quats.reserve_exact(count);
+        self.log_scales.reserve_exact(count);
+        self.opacity_logits.reserve_exact(count);
+        self.sh_coeffs.reserve_exact(count * self.coeffs());
+    }
+
     /// Appends Gaussian `index` of `other`; both must have the same degree.
     pub fn push_from(&mut self, other: &Self, index: usize) {
         debug_assert_eq!(self.sh_degree, other.sh_degree);

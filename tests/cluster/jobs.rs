@@ -3,6 +3,7 @@
 //! The trainer is deterministic: its result depends on its input and on every iteration. So a resumed run
 //! gives the bytes of an undisturbed one only if the checkpoint worked.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
@@ -27,15 +28,30 @@ async fn a_job_goes_from_photographs_to_artifacts() {
     assert_eq!((job.partitions, job.progress), (2, 1.0));
 
     let files = cluster.artifacts(&job.job_id).await;
-    for name in
-        ["model.ply", "model.json", "cameras.json", "plan.json", "plan.png", "metrics.json", "run.json"]
-    {
+    for name in [
+        "model.ply",
+        "model.compressed.ply",
+        "model.json",
+        "cameras.json",
+        "plan.json",
+        "plan.png",
+        "metrics.json",
+        "run.json",
+    ] {
         assert!(files.contains_key(name), "no {name} among {:?}", files.keys());
     }
     assert_eq!(files.keys().filter(|path| path.starts_with("renders/0")).count(), 4);
     assert_eq!(files.keys().filter(|path| path.starts_with("renders/border_0")).count(), 4);
     let model = fathom_core::ply::from_bytes(&files["model.ply"], "model.ply").unwrap();
     assert_eq!(model.len(), support::POINTS, "every point belongs to exactly one cell");
+    let models = job.tasks.iter().filter_map(|task| Some((task.stage(), task.model.clone()?)));
+    let models: BTreeMap<_, _> = models.collect();
+    assert_eq!(models[&v1::Stage::Merge].size_bytes, files["model.ply"].len() as u64);
+    assert!(models.contains_key(&v1::Stage::Partition), "pages show finished partitions: {models:?}");
+    for model in models.values() {
+        let request = v1::ReadBlobRequest { digest: model.digest.clone(), ..Default::default() };
+        assert!(cluster.uploads().read_blob(request).await.is_ok(), "{model:?}");
+    }
     check_metrics(&serde_json::from_slice(&files["metrics.json"]).unwrap());
 
     let events = cluster.events(&job.job_id, 0).await;

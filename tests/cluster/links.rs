@@ -40,7 +40,7 @@ async fn a_link_reads_its_job_and_nothing_else() {
     // A file of the job, by its digest.
     assert!(guest.uploads().read_blob(read(blob(POINTS).digest, &job.job_id)).await.is_ok());
     let manifest = job.manifest.clone().unwrap().digest;
-    assert!(guest.uploads().read_blob(read(manifest, &job.job_id)).await.is_ok());
+    assert!(guest.uploads().read_blob(read(manifest.clone(), &job.job_id)).await.is_ok());
     let who = guest.admin().get_caller(GetCallerRequest {}).await.unwrap().into_inner();
     assert_eq!((who.role(), who.job_id.as_str(), who.tenant.as_str()), (Role::Viewer, &*job.job_id, "reef"));
     assert_eq!(who.expire_time, link.expire_time);
@@ -71,6 +71,8 @@ async fn a_link_reads_its_job_and_nothing_else() {
     for (path, expected) in [
         (format!("/jobs/{}", job.job_id), 200),
         (format!("/jobs/{}/history", job.job_id), 200),
+        (format!("/jobs/{}/blobs/{manifest}", job.job_id), 200),
+        (format!("/jobs/{}/blobs/{}", job.job_id, secret.digest), 404),
         (format!("/jobs/{}", other.job_id), 404),
         (format!("/jobs/{}/events", other.job_id), 404),
         (format!("/jobs/{}/logs", other.job_id), 404),

@@ -30,3 +30,4 @@ mod stragglers;
 mod support;
 mod web;
 mod webhook;
+mod workers;

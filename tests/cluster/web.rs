@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use fathom_coordinator::json;
-use fathom_proto::admin::v1::Role;
+use fathom_proto::admin::v1::{ListTokensRequest, Role};
 use fathom_proto::v1;
 use fathom_proto::worker::v1 as worker_v1;
 use fathom_worker::blobs::to_proto;
@@ -101,6 +101,12 @@ async fn json_calls_say_and_do_what_grpc_does() {
     let (status, datasets) = http.get("/datasets").await;
     assert_eq!((status, &datasets["datasets"][0]["dataset"]), (200, &json!("wreck")));
     assert_eq!(http.get("/datasets/wreck").await.1["files"], 18);
+    let asked = v1::InspectDatasetRequest { dataset_id: "wreck".into(), ..Default::default() };
+    let inspection = cluster.uploads().inspect_dataset(asked).await.unwrap().into_inner();
+    let inspected = http.say(Method::POST, "/datasets/wreck/inspect", Value::Null).await;
+    assert_eq!(inspected, (200, json::inspection(&inspection)));
+    let wrong = json!({"config": {"train": {"iterations": "many"}}});
+    assert_eq!(http.say(Method::POST, "/datasets/wreck/inspect", wrong).await.0, 400);
     let new = json!({
         "dataset": "wreck", "name": "over HTTP", "request_id": "one",
         "config": {"partition": {"columns": 2}, "train": {"iterations": 400}},
@@ -175,6 +181,11 @@ async fn json_calls_say_and_do_what_grpc_does() {
         (model.status(), model.bytes().await.unwrap()),
         (StatusCode::PARTIAL_CONTENT, whole[100..].to_vec().into())
     );
+    let plan = http.get(&path).await.1["plan"].as_str().unwrap().to_owned();
+    let plan = http.request(Method::GET, &format!("{path}/blobs/{plan}")).send().await.unwrap();
+    assert_eq!(plan.headers()["content-type"], "application/octet-stream");
+    assert_eq!(plan.bytes().await.unwrap(), artifacts["plan.json"].as_slice());
+    assert_eq!(reason(&http.get(&format!("{path}/blobs/{}", "0".repeat(64))).await), (404, "BLOB_NOT_FOUND"));
     let head = http.request(Method::HEAD, &format!("{path}/files/model.ply")).send().await.unwrap();
     assert_eq!(head.headers()["content-length"], whole.len().to_string().as_str());
     // A weak tag among others, as a proxy that compresses sends it.
@@ -211,7 +222,6 @@ async fn a_log_comes_in_pages_and_by_level() {
     let request =
         worker_v1::AppendLogsRequest { lease: Some(lease.clone()), lines: (1..=5).map(line).collect() };
     worker.append_logs(request).await.unwrap();
-
     let path = format!("/jobs/{job}/logs?task={}", lease.task_id);
     let (mut after, mut all, mut pages) = (0, Vec::new(), 0);
     loop {
@@ -367,7 +377,15 @@ async fn tokens_roles_and_tenants_are_those_of_grpc() {
     assert_eq!(reason(&http(Some(&reef)).get("/workers").await), (403, "ROLE_REFUSED"));
     assert_eq!(reason(&http(Some(&wreck)).get(&format!("/jobs/{job}")).await), (404, "JOB_NOT_FOUND"));
     assert_eq!(http(Some(&wreck)).get("/jobs").await.1["jobs"], json!([]));
-    assert_eq!(http(Some(&cluster.first_token())).get("/workers").await.0, 200);
+    assert_eq!(reason(&http(Some(&reef)).get("/tokens").await), (403, "ROLE_REFUSED"));
+    let operator = http(Some(&cluster.first_token()));
+    assert_eq!(operator.get("/workers").await.0, 200);
+    let tokens =
+        cluster.operator().admin().list_tokens(ListTokensRequest {}).await.unwrap().into_inner().tokens;
+    assert!(tokens.len() > 3, "{tokens:?}");
+    assert_eq!(operator.get("/tokens").await.1["tokens"], Value::from_iter(tokens.iter().map(json::token)));
+    // Only the page of one process has invitations.
+    assert_eq!(reason(&operator.say(Method::POST, "/enter", Value::Null).await), (401, "TOKEN_REFUSED"));
 
     // A stream ends with the token that opened it.
     let own = cluster.lasting_job(&cluster.with(Some(&wreck)), "wreck", "two").await.job_id;

@@ -10,8 +10,12 @@ use crate::processes::{can_train, fathom, tiny_scene, under};
 
 /// Status and content of an answer.
 fn get(address: &str, path: &str, headers: &str) -> (u16, String) {
+    call("GET", address, path, headers)
+}
+
+fn call(method: &str, address: &str, path: &str, headers: &str) -> (u16, String) {
     let mut stream = TcpStream::connect(address).unwrap();
-    write!(stream, "GET {path} HTTP/1.1\r\n{headers}Connection: close\r\n\r\n").unwrap();
+    write!(stream, "{method} {path} HTTP/1.1\r\n{headers}Connection: close\r\n\r\n").unwrap();
     let mut answer = String::new();
     stream.read_to_string(&mut answer).unwrap();
     let (head, content) = answer.split_once("\r\n\r\n").unwrap();
@@ -30,18 +34,33 @@ fn the_page_of_a_run_is_for_the_one_who_started_it() {
     let mut run = fathom(&[&train[..], &settings].concat());
     let mut run = run.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
     let mut lines = BufReader::new(run.stderr.take().unwrap()).lines();
-    let link =
-        lines.by_ref().find_map(|line| Some(line.ok()?.split_once("see the run at http://")?.1.to_owned()));
-    // The process must not wait for a reader.
-    std::thread::spawn(move || lines.for_each(drop));
-    let link = link.expect("a link");
-    let (address, token) = link.split_once("/#token=").expect("a token behind the address");
+    let mut link_behind = |words: &str| {
+        let found = lines.by_ref().find_map(|line| Some(line.ok()?.split_once(words)?.1.to_owned()));
+        found.unwrap_or_else(|| panic!("no link behind {words:?}"))
+    };
+    let link = link_behind("see the run at http://");
+    let (address, invitation) = link.split_once("/#invitation=").expect("an invitation behind the address");
     let host = format!("Host: {address}\r\n");
     let with = |token: &str| format!("{host}Authorization: Bearer {token}\r\n");
+    let enter = |invitation: &str| call("POST", address, "/api/v1/enter", &with(invitation));
+
+    // An invitation reads nothing, and opens the page once.
+    assert_eq!(get(address, "/api/v1/jobs", &with(invitation)).0, 401, "with the invitation itself");
+    assert_eq!(enter(&format!("fathom_{}_{}", "a".repeat(12), "b".repeat(64))).0, 401);
+    let (status, entered) = enter(invitation);
+    assert_eq!(status, 200, "{entered}");
+    assert_eq!(enter(invitation).0, 401, "a second time");
+    let entered: Value = serde_json::from_str(&entered).unwrap();
+    let token = entered["token"].as_str().unwrap();
+    let next = link_behind("the link to the page has been used; the next one is http://");
+    let (_, next) = next.split_once("/#invitation=").expect("an invitation behind the address");
+    assert_eq!(enter(next).0, 200, "the next link");
+    // The process must not wait for a reader.
+    std::thread::spawn(move || lines.for_each(drop));
 
     let (status, html) = get(address, "/", &host);
     assert!(status == 200 && html.contains("<title>"), "{status}: {html}");
-    assert!(!html.contains(token), "the token is in the page");
+    assert!(!html.contains(token) && !html.contains(invitation), "a secret is in the page");
     let caller = get(address, "/api/v1/caller", &with(token));
     let caller: Value =
         (caller.0 == 200).then(|| serde_json::from_str(&caller.1).unwrap()).expect("a caller");
@@ -69,5 +88,11 @@ fn the_page_of_a_run_is_for_the_one_who_started_it() {
         std::thread::sleep(std::time::Duration::from_millis(200));
     }
     assert!(run.wait().unwrap().success());
+    for log in std::fs::read_dir(folder.path().join("out/logs")).unwrap() {
+        let text = std::fs::read_to_string(log.unwrap().path()).unwrap();
+        for secret in [token, invitation, next].map(|token| token.rsplit('_').next().unwrap()) {
+            assert!(!text.contains(secret), "a secret is in a log of the run");
+        }
+    }
     assert!(TcpStream::connect(address).is_err(), "the page ends with the run");
 }

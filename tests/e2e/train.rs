@@ -29,6 +29,7 @@ fn a_scene_becomes_one_model_with_a_report() {
     assert_eq!(metrics["partitions"].as_array().map(Vec::len), Some(4));
     for file in [
         "model.ply",
+        "model.compressed.ply",
         "model.json",
         "cameras.json",
         "plan.json",

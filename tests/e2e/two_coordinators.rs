@@ -44,7 +44,8 @@ fn two_coordinators_share_tokens_workers_quotas_and_logs() {
         let words = [words, &["--coordinator", url, "--token-file", &token]].concat();
         words.into_iter().map(str::to_owned).collect()
     };
-    for (name, role, tenant) in [("ana", "submitter", "reef"), ("gpu", "worker", "")] {
+    // Whoever knows the last one knows all: the worker would end if its token were refused.
+    for (name, role, tenant) in [("gpu", "worker", ""), ("ana", "submitter", "reef")] {
         let words = ["token", "issue", name, "--role", role, "--tenant", tenant];
         std::fs::write(path(name), succeed(&with(&words, &first, "operator"))).expect("written");
     }

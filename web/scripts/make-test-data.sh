@@ -4,8 +4,10 @@
 #   scripts/make-test-data.sh FATHOM DATA [quick]
 #
 # FATHOM is the program, DATA the folder to fill. The test reads DATA from VIEWER_DATA, or from test-data/.
-# With `quick` there are only two small models, one for each form of the water.
+# With `quick` there are only two small models, one for each form of the water. Otherwise a wreck of a real
+# survey is trained too, if SESA (default: ../shared/scenes/sesa-wreck beside the repository) is there.
 set -eu
+web=$(cd "$(dirname "$0")/.." && pwd)
 fathom=$1
 data=$2
 mkdir -p "$data/renders"
@@ -33,6 +35,25 @@ handover() {
     view='c%3D0%2C-2%2C0%2C-0.7071068%2C0%2C0%2C0.7071068%26f%3D50%26m%3Dwater%2Cnone%26s%3D0.5%26w%3D1'
     "$fathom" export "$data/pixel" --html "$data/handover/views.html" \
         --views "http://127.0.0.1:1/x/view.html#c=0,-3,0,-0.7071068,0,0,0.7071068&f=50&m=clear,none&s=0.5&w=1&b=Bow+%3C1%3E~$view"
+}
+
+# A few cameras of a survey of hundreds, and pictures of them.
+survey() {
+    scene=${SESA:-$web/../../shared/scenes/sesa-wreck}
+    if [ ! -d "$scene/sparse" ]; then
+        echo "$scene is not there, so its model is not made"
+        return
+    fi
+    "$fathom" train "$scene" -o "$data/sesa" --allow-cpu --max-gaussians 6000 --iterations 300 \
+        --max-resolution 160 --test-every 100
+    "$web/node_modules/.bin/node" --input-type=module - "$data/sesa/cameras.json" <<'END'
+import { readFileSync, writeFileSync } from 'node:fs';
+const [path] = process.argv.slice(2);
+const some = JSON.parse(readFileSync(path, 'utf8')).filter((_, i) => i % 58 === 0);
+writeFileSync(path, JSON.stringify(some));
+END
+    render sesa clear --max-resolution 160
+    render sesa water --max-resolution 160 --water on
 }
 
 if [ "${3:-}" = quick ]; then
@@ -85,3 +106,4 @@ done
 ranges pixel
 ranges open
 handover
+survey

@@ -2,8 +2,10 @@
 
 use std::collections::{BTreeMap, HashMap};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use bytes::Bytes;
+use fathom_core::config::JobConfig;
 use fathom_core::exchange::Exchange;
 use fathom_core::scene::{BlobRef, Manifest};
 use fathom_observe::threads;
@@ -60,7 +62,7 @@ impl Fetch<'_> {
         // Points initialise runs, mark the end of the scene under water, and serve as a reference for
         // measurements.
         want(&manifest.points);
-        let files: HashMap<String, PathBuf> = futures::stream::iter(wanted.into_values())
+        let mut files: HashMap<String, PathBuf> = futures::stream::iter(wanted.into_values())
             .map(|blob| async move {
                 let path = self.cache.fetch(&self.blobs, &blob).await?;
                 Ok::<_, WorkerError>((blob.digest, path))
@@ -69,6 +71,7 @@ impl Fetch<'_> {
             .try_collect()
             .await
             .map_err(TaskError::environment)?;
+        self.fetch_previewed(&manifest, &common, &config, &mut files).await;
         let mut inputs = HashMap::new();
         for input in &assignment.inputs {
             inputs.extend(self.fetch_some(&input.blob).await?.map(|path| (input.artifact(), path)));
@@ -98,7 +101,41 @@ impl Fetch<'_> {
             checkpoint_iteration: if checkpoint.is_some() { assignment.checkpoint_iteration } else { 0 },
             checkpoint,
             files,
+            reading: Arc::default(),
         })
+    }
+
+    /// The photographs of the views in previews. The task does not need them, so a failure is not one of the
+    /// task.
+    async fn fetch_previewed(
+        &self,
+        manifest: &Manifest,
+        common: &v1::CommonSpec,
+        config: &JobConfig,
+        files: &mut HashMap<String, PathBuf>,
+    ) {
+        if config.train.preview_seconds == 0 {
+            return;
+        }
+        let views = common.previews.iter().filter_map(|&index| manifest.views.get(index as usize));
+        let wanted = views.flat_map(|view| [Some(view.image.clone()), view.mask.clone()]).flatten();
+        let wanted: Vec<BlobRef> = wanted.filter(|blob| !files.contains_key(&blob.digest)).collect();
+        let fetched = futures::stream::iter(wanted).map(|blob| async move {
+            match self.cache.fetch(&self.blobs, &blob).await {
+                Ok(path) => Some((blob.digest, path)),
+                Err(error) => {
+                    tracing::debug!(%error, digest = %blob.digest, "a preview has no photograph");
+                    None
+                }
+            }
+        });
+        files.extend(
+            fetched
+                .buffer_unordered(FETCHES_AT_ONCE)
+                .filter_map(std::future::ready)
+                .collect::<Vec<_>>()
+                .await,
+        );
     }
 
     /// The checkpoint of an earlier attempt; `None` if there is none or it is damaged. Its iterations can be

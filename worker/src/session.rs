@@ -460,19 +460,15 @@ impl Session {
         loop {
             let (iteration, pictures) = mailbox.take().await;
             let mut uploaded = Vec::with_capacity(pictures.len());
-            for Picture { view, render, clear } in pictures {
+            for Picture { view, render, clear, psnr_db } in pictures {
                 let send = async |jpeg: Bytes| blobs.upload(&BlobSource::Bytes(jpeg)).await.ok();
                 let Some(render) = send(render).await else { continue };
                 let clear = match clear {
                     Some(clear) => send(clear).await,
                     None => None,
                 };
-                uploaded.push(Preview {
-                    view,
-                    iteration,
-                    render: Some(to_proto(&render)),
-                    clear: clear.as_ref().map(to_proto),
-                });
+                let (render, clear) = (Some(to_proto(&render)), clear.as_ref().map(to_proto));
+                uploaded.push(Preview { view, iteration, render, clear, psnr_db });
             }
             self.pulse.show(uploaded);
         }

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::Args;
+use fathom_coordinator::access::Token;
 use fathom_coordinator::{CoordinatorConfig, serve};
 use serde::Serialize;
 use serde_json::Value;
@@ -25,7 +26,7 @@ pub struct CoordinatorArgs {
     /// TOML file with these settings, under the names of the flags with _ for -; flags and environment win
     #[arg(long, value_name = "FILE", env = "FATHOM_CONFIG")]
     config: Option<PathBuf>,
-    /// Require a token for the HTTP interface, made for this process and printed with the address of the page
+    /// Require a token for the HTTP interface, which an invitation in the printed link to the page gives
     #[arg(long, hide = true)]
     own_page: bool,
     /// Stop when standard input closes, so that a parent process never leaves it behind
@@ -176,9 +177,20 @@ pub async fn run(args: CoordinatorArgs) -> Result<()> {
     let config = CoordinatorConfig { own_page: args.own_page, ..config };
     let failed = |error: fathom_coordinator::CoordinatorError| CliError::Message(error.to_string());
     let coordinator = serve(config).await.map_err(failed)?;
-    if let (Some(address), Some(token)) = (coordinator.web_address(), coordinator.page_token()) {
+    if let (Some(address), Some(mut invitations)) = (coordinator.web_address(), coordinator.invitations()) {
         let scheme = if coordinator.url().starts_with("https:") { "https" } else { "http" };
-        output::line(format!("{}{scheme}://{address}/#token={token}", children::PAGE));
+        let print = move |invitation: &Option<Token>| {
+            if let Some(invitation) = invitation {
+                let link = format!("{scheme}://{address}/#invitation={}", invitation.reveal());
+                output::line(format!("{}{link}", children::PAGE));
+            }
+        };
+        print(&invitations.borrow_and_update());
+        tokio::spawn(async move {
+            while invitations.changed().await.is_ok() {
+                print(&invitations.borrow_and_update());
+            }
+        });
     }
     output::line(format!("{}{}", children::LISTENING, coordinator.url()));
     let parent_gone = args.stop_with_stdin.then(children::stdin_closes);

@@ -147,7 +147,7 @@ async fn issue(args: IssueArgs) -> Result<()> {
         expires_in_seconds: u64::from(args.days) * 24 * 60 * 60,
     };
     let issued = args.service.client().await?.issue_token(request).await?;
-    let mut value = issued.token.as_ref().map(token_json).unwrap_or_default();
+    let mut value = issued.token.as_ref().map(json::token).unwrap_or_default();
     value["token"] = issued.secret.clone().into();
     print_secret(&issued.secret, value, args.json)
 }
@@ -174,7 +174,7 @@ async fn list(args: ListArgs) -> Result<()> {
         }
     };
     if args.json {
-        return output::json(&tokens.iter().map(token_json).collect::<Vec<_>>());
+        return output::json(&tokens.iter().map(json::token).collect::<Vec<_>>());
     }
     if tokens.is_empty() {
         output::line(format!("no tokens {of}"));
@@ -186,7 +186,7 @@ async fn list(args: ListArgs) -> Result<()> {
 async fn revoke(args: RevokeArgs) -> Result<()> {
     let token = args.service.client().await?.revoke_token(&args.id, args.last).await?;
     if args.json {
-        return output::json(&token_json(&token));
+        return output::json(&json::token(&token));
     }
     output::line(token_line(&token));
     Ok(())
@@ -216,19 +216,9 @@ fn of_store(record: &access::TokenRecord) -> Token {
     }
 }
 
-fn role_word(token: &Token) -> &'static str {
-    match token.role() {
-        Role::Unspecified => "unknown",
-        Role::Viewer => "viewer",
-        Role::Submitter => "submitter",
-        Role::Operator => "operator",
-        Role::Worker => "worker",
-    }
-}
-
 fn token_line(token: &Token) -> String {
     let tenant = if token.tenant.is_empty() { "all tenants" } else { &token.tenant };
-    let mut line = format!("{}  {:<9} of {tenant}: {}", token.token_id, role_word(token), token.name);
+    let mut line = format!("{}  {:<9} of {tenant}: {}", token.token_id, json::role(token.role()), token.name);
     if token.revoke_time.is_some() {
         line += ", revoked";
     } else if let Some(end) = &token.expire_time {
@@ -242,17 +232,4 @@ fn token_line(token: &Token) -> String {
         };
     }
     line
-}
-
-fn token_json(token: &Token) -> Value {
-    json!({
-        "id": token.token_id,
-        "name": token.name,
-        "role": role_word(token),
-        "tenant": (!token.tenant.is_empty()).then_some(&token.tenant),
-        "job": (!token.job_id.is_empty()).then_some(&token.job_id),
-        "created_unix_seconds": json::unix_seconds(&token.create_time),
-        "expires_unix_seconds": json::unix_seconds(&token.expire_time),
-        "revoked_unix_seconds": json::unix_seconds(&token.revoke_time),
-    })
 }

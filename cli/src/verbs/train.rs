@@ -84,6 +84,9 @@ pub async fn run(args: TrainArgs) -> Result<()> {
     let mut children = Children::start(&run.store(), &run.logs(), &worker_arguments, with_page).await?;
     if let Some(page) = &children.page {
         output::remark(format!("see the run at {page}"));
+        if std::env::var_os("SSH_CONNECTION").is_some() {
+            output::remark(from_afar(page));
+        }
     }
     let job = Submission { data: &data, prepared: &prepared, config: &config, begin };
     let url = children.url.clone();
@@ -105,6 +108,15 @@ pub async fn run(args: TrainArgs) -> Result<()> {
     outcome?;
     run.finish()?;
     report(&run.out, args.json)
+}
+
+/// How to open a page of this machine from the one where the user sits.
+fn from_afar(page: &str) -> String {
+    let port =
+        page.split(['/', '#']).nth(2).and_then(|host| host.rsplit_once(':')).map_or("PORT", |(_, port)| port);
+    format!(
+        "from the machine that you sit at: ssh -L {port}:127.0.0.1:{port} THIS_MACHINE, then open this link there"
+    )
 }
 
 /// Sets the workers that `--partitions auto` plans for, even if they have not registered yet. Workers that
@@ -183,8 +195,9 @@ struct RunRequest {
 }
 
 /// Files of a result. They are never replaced, so none may exist when a run starts.
-const RESULTS: [&str; 9] = [
+const RESULTS: [&str; 10] = [
     "model.ply",
+    "model.compressed.ply",
     "model.json",
     "water.json",
     "metrics.json",
@@ -303,6 +316,13 @@ mod tests {
 
     fn refused(out: &Path, resume: bool) -> String {
         RunFolder::open(out, resume, None).err().map(|error| error.to_string()).unwrap_or_default()
+    }
+
+    #[test]
+    fn a_user_on_another_machine_gets_the_way_to_the_page() {
+        let said = from_afar("http://127.0.0.1:7480/#invitation=fathom_a_b");
+        assert!(said.contains("ssh -L 7480:127.0.0.1:7480 "), "{said}");
+        assert!(!said.contains("fathom_"), "the secret once more: {said}");
     }
 
     #[test]

@@ -140,6 +140,9 @@ fn worker_line(worker: &Worker) -> String {
     for held in &worker.held {
         line += &format!("; {} of {}", held.task_id, held.job_id);
     }
+    if worker.iterations_per_second > 0.0 {
+        line += &format!(", {:.1} iterations/s", worker.iterations_per_second);
+    }
     if !worker.reason.is_empty() {
         line += &format!(" ({})", worker.reason);
     }

@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use tokio::sync::watch;
 
-use super::{Principal, Token, TokenRecord};
+use super::{Principal, Role, Token, TokenRecord};
 use crate::clock::Clock;
 use crate::schedule::Tenant;
 use crate::store::{AccessStore, StoreError};
@@ -20,6 +20,8 @@ pub struct Access {
     noted: AtomicU64,
     /// Moves when one of them changes.
     changes: watch::Sender<()>,
+    /// What [`Access::enter`] takes, once each; `None` where it takes nothing.
+    invitation: watch::Sender<Option<Token>>,
 }
 
 /// A token may outlast the longest timer.
@@ -42,13 +44,47 @@ pub enum Refused {
 impl Access {
     /// For a coordinator without tokens.
     pub fn open() -> Self {
-        Self { tokens: None, noted: AtomicU64::new(0), changes: watch::channel(()).0 }
+        let (changes, invitation) = (watch::channel(()).0, watch::channel(None).0);
+        Self { tokens: None, noted: AtomicU64::new(0), changes, invitation }
     }
 
     /// For a coordinator that requires one of `tokens`.
     pub fn by_tokens(tokens: Vec<TokenRecord>) -> Self {
         let by_id = tokens.into_iter().map(|token| (token.id.clone(), token)).collect();
         Self { tokens: Some(RwLock::new(by_id)), ..Self::open() }
+    }
+
+    /// For the page of one process: it requires a token, which only [`Access::enter`] gives.
+    pub fn by_invitation() -> Self {
+        let invitation = watch::channel(Some(Token::random())).0;
+        Self { invitation, ..Self::by_tokens(Vec::new()) }
+    }
+
+    /// The invitation that is valid now, and each later one.
+    pub fn invitations(&self) -> watch::Receiver<Option<Token>> {
+        self.invitation.subscribe()
+    }
+
+    /// Takes the invitation in the value of an `authorization` header, which is then void: another one takes
+    /// its place. Returns a token for an operator, which is valid as long as this process and stored nowhere.
+    ///
+    /// # Errors
+    /// When it is missing, or not the valid one.
+    pub fn enter(&self, authorization: Option<&str>, now_ms: u64) -> Result<Token, Refused> {
+        let shown = bearer(authorization)?;
+        let taken = self.invitation.send_if_modified(|valid| {
+            let is_it = valid.as_ref().is_some_and(|valid| valid.same_as(&shown));
+            if is_it {
+                *valid = Some(Token::random());
+            }
+            is_it
+        });
+        if !taken {
+            return Err(Refused::NotValid);
+        }
+        let token = Token::random();
+        self.note(TokenRecord::new(&token, "page".to_owned(), Role::Operator, None, now_ms, None));
+        Ok(token)
     }
 
     /// Whether tokens are required.
@@ -62,11 +98,7 @@ impl Access {
     /// When it is missing or invalid.
     pub fn principal(&self, authorization: Option<&str>, now_ms: u64) -> Result<Principal, Refused> {
         let Some(tokens) = &self.tokens else { return Ok(Principal::anonymous()) };
-        let shown = authorization.ok_or(Refused::Missing)?;
-        // The name of a scheme is case-insensitive (RFC 9110, 11.1).
-        let is_bearer = |scheme: &&str| scheme.eq_ignore_ascii_case("bearer");
-        let token = shown.split_once(' ').filter(|(scheme, _)| is_bearer(scheme));
-        let token = token.and_then(|(_, token)| Token::parse(token.trim())).ok_or(Refused::NotValid)?;
+        let token = bearer(authorization)?;
         let tokens = tokens.read().unwrap_or_else(PoisonError::into_inner);
         let record = tokens.get(token.id()).filter(|record| record.is_of(&token));
         let record = record.filter(|record| holds(&tokens, record, now_ms));
@@ -162,6 +194,15 @@ impl Access {
     }
 }
 
+/// The token in the value of an `authorization` header.
+fn bearer(authorization: Option<&str>) -> Result<Token, Refused> {
+    let shown = authorization.ok_or(Refused::Missing)?;
+    // The name of a scheme is case-insensitive (RFC 9110, 11.1).
+    let is_bearer = |scheme: &&str| scheme.eq_ignore_ascii_case("bearer");
+    let token = shown.split_once(' ').filter(|(scheme, _)| is_bearer(scheme));
+    token.and_then(|(_, token)| Token::parse(token.trim())).ok_or(Refused::NotValid)
+}
+
 /// Whether a token is valid now, and so is the one with which it was made.
 fn holds(tokens: &HashMap<String, TokenRecord>, record: &TokenRecord, now_ms: u64) -> bool {
     let issuer = record.issued_by.as_ref();
@@ -174,9 +215,29 @@ mod tests {
     use tonic::async_trait;
 
     use super::*;
-    use crate::access::Role;
     use crate::schedule::{Quota, Rules, Usage};
     use crate::store::MemoryStore;
+
+    #[test]
+    fn an_invitation_opens_one_page() {
+        let access = Access::by_invitation();
+        let mut invitations = access.invitations();
+        let mut shown = || {
+            let valid = invitations.borrow_and_update().as_ref().map(Token::reveal).unwrap_or_default();
+            format!("Bearer {valid}")
+        };
+        let (first, stranger) = (shown(), format!("Bearer {}", Token::random().reveal()));
+        assert_eq!(access.enter(None, 5), Err(Refused::Missing));
+        assert_eq!(access.enter(Some(&stranger), 5), Err(Refused::NotValid));
+        assert_eq!(access.principal(Some(&first), 5), Err(Refused::NotValid), "it reads nothing itself");
+        let token = access.enter(Some(&first), 5).unwrap_or_else(|error| panic!("{error}"));
+        let caller = access.principal(Some(&format!("Bearer {}", token.reveal())), 6);
+        assert_eq!(caller.map(|caller| caller.role), Ok(Role::Operator));
+        assert_eq!(access.enter(Some(&first), 5), Err(Refused::NotValid), "a second time");
+        let second = shown();
+        assert!(second != first && access.enter(Some(&second), 7).is_ok(), "the next one");
+        assert_eq!(Access::by_tokens(Vec::new()).enter(Some(&second), 7), Err(Refused::NotValid));
+    }
 
     #[test]
     fn only_a_valid_token_is_admitted() {

@@ -84,7 +84,13 @@ pub fn task_stats() -> worker::TaskStats {
 /// A point of a curve with a preview.
 pub fn measured() -> worker::Measured {
     let progress = v1::Progress { iteration: 7, loss: 0.1, ..Default::default() };
-    let preview = v1::Preview { view: "one.jpg".into(), iteration: 7, render: blob(), clear: blob() };
+    let preview = v1::Preview {
+        view: "one.jpg".into(),
+        iteration: 7,
+        render: blob(),
+        clear: blob(),
+        psnr_db: Some(21.5),
+    };
     worker::Measured { progress: Some(progress), age_ms: 500, previews: vec![preview] }
 }
 

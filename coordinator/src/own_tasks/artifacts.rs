@@ -21,7 +21,7 @@ use serde_json::{Value, json};
 use super::evaluation::{self, Evaluated};
 use super::input::{JobInput, blocking, made, read_plan};
 use super::merge::MergeReport;
-use super::{OwnTaskError, exchange};
+use super::{OwnTaskError, exchange, viewing_copy};
 use crate::objects::{BlobStore, ObjectError};
 use crate::schedule::{Artifact, HeldOut, JobRecord, Stage, TaskId, TaskOutput, TaskState, TaskStats};
 use crate::store::JobView;
@@ -81,6 +81,9 @@ pub async fn assemble(objects: &Arc<BlobStore>, view: &JobView) -> Result<TaskOu
         ("plan.png".to_owned(), plan_png),
     ];
     files.push(("model.json".to_owned(), manifest_of(objects, &report.manifest, &model).await?));
+    if let Some(copy) = viewing_copy::make(objects, view, &model).await? {
+        files.push((viewing_copy::FILE.to_owned(), copy));
+    }
     for (path, value) in [
         ("cameras.json", cameras_json(&views)),
         ("metrics.json", {

@@ -1,6 +1,6 @@
 //! AdminService, for operators. Tenants and tokens are in `tenants.rs`, backups in `backup.rs`.
 
-use std::collections::HashMap;
+use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
 
 use fathom_proto::admin::v1;
@@ -11,14 +11,22 @@ use super::backup::BackupStream;
 use super::encode;
 use super::tenants::encode_role;
 use crate::access::guard::caller;
-use crate::schedule::{Attempt, Lease};
+use crate::schedule::{Attempt, JobId, Lease, LiveProgress, TaskId};
 use crate::service_error::{ServiceError, check_line};
 use crate::state::State;
-use crate::store::WorkerMark;
+use crate::store::{StoreError, WorkerMark};
 use crate::worker_registry::KnownWorker;
 
 /// Longest reason, bytes; it goes into a row of the store.
 const MAX_REASON_BYTES: usize = 1000;
+
+/// A lease that is held.
+struct Held {
+    lease: Lease,
+    attempt: Attempt,
+    /// Iterations per second that it reported last; 0 where that is not known.
+    rate: f64,
+}
 
 /// The service.
 pub struct Admin(pub Arc<State>);
@@ -26,7 +34,7 @@ pub struct Admin(pub Arc<State>);
 impl Admin {
     /// Workers that have called recently, by name, then those with only a mark left.
     async fn list(&self) -> Result<Vec<v1::Worker>, ServiceError> {
-        let held = self.0.jobs.leased().await?;
+        let held = self.held().await?;
         let mut all: HashMap<String, Option<KnownWorker>> =
             self.0.workers.marked().into_iter().map(|id| (id, None)).collect();
         all.extend(self.0.workers.all().into_iter().map(|(id, worker)| (id, Some(worker))));
@@ -38,17 +46,50 @@ impl Admin {
         Ok(workers)
     }
 
+    /// All leases that are held, each with the iterations per second that its task reported last. Of two
+    /// attempts at a task only one is known, and not which: they have none.
+    async fn held(&self) -> Result<Vec<Held>, ServiceError> {
+        let leased = self.0.jobs.leased().await?;
+        let jobs: BTreeSet<JobId> = leased.iter().map(|(lease, _)| lease.job.clone()).collect();
+        let mut rates = HashMap::new();
+        for job in jobs {
+            match self.0.jobs.progress(&job).await {
+                Ok((live, _)) => {
+                    let of_task = |(task, live): (TaskId, LiveProgress)| {
+                        ((job.clone(), task), f64::from(live.iterations_per_second))
+                    };
+                    rates.extend(live.into_iter().map(of_task));
+                }
+                // It ended or was deleted meanwhile.
+                Err(StoreError::JobNotFound(_)) => {}
+                Err(error) => return Err(error.into()),
+            }
+        }
+        let mut attempts: HashMap<(JobId, TaskId), usize> = HashMap::new();
+        for (lease, _) in &leased {
+            *attempts.entry((lease.job.clone(), lease.task)).or_default() += 1;
+        }
+        let held = leased.into_iter().map(|(lease, attempt)| {
+            let task = (lease.job.clone(), lease.task);
+            let rate = rates.get(&task).filter(|_| attempts[&task] == 1).copied().unwrap_or_default();
+            Held { lease, attempt, rate }
+        });
+        Ok(held.collect())
+    }
+
     /// The known data of a worker; `None` if it has not called since the coordinator started, or not
     /// recently.
-    fn worker(&self, id: &str, worker: Option<&KnownWorker>, held: &[(Lease, Attempt)]) -> v1::Worker {
+    fn worker(&self, id: &str, worker: Option<&KnownWorker>, held: &[Held]) -> v1::Worker {
         let mark = self.0.workers.mark_of(id);
         let state = match &mark {
             None => v1::WorkerState::Active,
             Some(mark) if mark.drains => v1::WorkerState::Draining,
             Some(_) => v1::WorkerState::Cordoned,
         };
-        let of_worker = held.iter().filter(|(_, attempt)| attempt.incarnation == id);
-        let held = of_worker.map(|(lease, attempt)| v1::HeldTask {
+        let of_worker = held.iter().filter(|held| held.attempt.incarnation == id);
+        let rates = of_worker.clone().map(|held| held.rate).filter(|rate| rate.is_finite());
+        let said = self.0.workers.last_words(id);
+        let held = of_worker.map(|Held { lease, attempt, .. }| v1::HeldTask {
             job_id: lease.job.to_string(),
             task_id: lease.task.to_string(),
             attempt: lease.attempt,
@@ -74,6 +115,9 @@ impl Admin {
             state: state.into(),
             reason: mark.map(|mark| mark.reason).unwrap_or_default(),
             held: held.collect(),
+            iterations_per_second: rates.sum(),
+            last_words_time: said.as_ref().map(|(_, time_ms)| encode::timestamp(*time_ms)),
+            last_words: said.map(|(line, _)| line).unwrap_or_default(),
             ..seen.unwrap_or_default()
         }
     }
@@ -90,7 +134,7 @@ impl Admin {
         tracing::info!(worker = %name, ?mark, "worker marked");
         self.0.workers.note_mark(worker_id, mark);
         self.0.wakeups.interrupted();
-        let held = self.0.jobs.leased().await?;
+        let held = self.held().await?;
         Ok(self.worker(worker_id, worker.as_ref(), &held))
     }
 

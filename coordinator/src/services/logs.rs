@@ -50,7 +50,7 @@ pub async fn append(
     if request.lines.iter().any(|line| line.number == 0) {
         return Err(bad("has one with the number 0; they count from 1".into()));
     }
-    let worker = holder(shared, &lease).await?;
+    let (worker, incarnation) = holder(shared, &lease).await?;
     let line = |line: worker_v1::LogLine| NewLine {
         from_worker: Some(line.number),
         time_ms: line.time.map_or(0, |time| encode::unix_ms(&time)),
@@ -63,12 +63,17 @@ pub async fn append(
         shared.objects.check_space(bytes).await?;
     }
     let (attempt, holder) = ((lease.task, lease.attempt), (worker.as_str(), lease.fence));
+    let is_said = |line: &&NewLine| line.severity >= Severity::Info;
+    if let Some((last, incarnation)) = lines.iter().rev().find(is_said).zip(incarnation) {
+        // By our clock: that of a worker may be wrong.
+        shared.workers.heard(&incarnation, &last.message, shared.clock.now_ms());
+    }
     Ok(shared.logs.append(&lease.job, attempt, holder, lines, shared.clock.now_ms()).await?)
 }
 
 /// The holder of a lease whose lines are still accepted: a task's latest attempt, or an earlier one whose
-/// first lines were accepted.
-async fn holder(shared: &State, lease: &Lease) -> Result<String, ServiceError> {
+/// first lines were accepted. Its name, and while it holds the lease its incarnation.
+async fn holder(shared: &State, lease: &Lease) -> Result<(String, Option<String>), ServiceError> {
     let job = shared.jobs.job_row(&lease.job).await?;
     let task = shared.jobs.task_row(&lease.job, lease.task).await?;
     let is_late = |ended_ms: u64| ended_ms.saturating_add(LATE_LINES_MS) < shared.clock.now_ms();
@@ -76,14 +81,14 @@ async fn holder(shared: &State, lease: &Lease) -> Result<String, ServiceError> {
         return Err(StoreError::Refused(Refusal::JobEnded).into());
     }
     if let Some(attempt) = task.held_under(lease) {
-        return Ok(attempt.worker.clone());
+        return Ok((attempt.worker.clone(), Some(attempt.incarnation.clone())));
     }
     let is_latest = lease.fence > 0 && (task.fence, task.attempts) == (lease.fence, lease.attempt);
     if is_latest && task.running().next().is_none() {
-        return Ok(task.worker);
+        return Ok((task.worker, None));
     }
     let earlier = shared.logs.holder(&lease.job, (lease.task, lease.attempt), lease.fence).await?;
-    earlier.ok_or_else(|| {
+    earlier.map(|worker| (worker, None)).ok_or_else(|| {
         let (task, given, latest) = (lease.task, lease.fence, task.fence);
         StoreError::Refused(Refusal::StaleFence { task, given, latest }).into()
     })

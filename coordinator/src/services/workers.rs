@@ -228,7 +228,12 @@ impl Workers {
             (class, message) = (FailClass::Input, lost);
         }
         tracing::warn!(job = %lease.job, task = %lease.task, attempt = lease.attempt, ?class, %message, "attempt failed");
+        let row = self.0.jobs.task_row(&lease.job, lease.task).await.ok();
+        let said = format!("{} failed: {message}", lease.task);
         self.0.jobs.fail(&lease, class, message, self.0.clock.now_ms()).await?;
+        if let Some(attempt) = row.as_ref().and_then(|row| row.held_under(&lease)) {
+            self.0.workers.heard(&attempt.incarnation, &said, self.0.clock.now_ms());
+        }
         // It may have ended the job.
         self.0.wakeups.interrupted();
         Ok(())

@@ -6,7 +6,7 @@ use axum::extract::State;
 use axum::http::{StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use axum::routing::{get, post};
-use fathom_proto::admin::v1::{GetCallerRequest, ListTenantsRequest, ListWorkersRequest};
+use fathom_proto::admin::v1::{GetCallerRequest, ListTenantsRequest, ListTokensRequest, ListWorkersRequest};
 use fathom_proto::v1;
 use serde::Deserialize;
 use serde_json::{Value, json};
@@ -40,11 +40,14 @@ pub fn router() -> Router<Web> {
         .route("/jobs/{job}/share", post(share_job))
         .route("/jobs/{job}/files", get(files::list))
         .route("/jobs/{job}/files/{*path}", get(files::read))
+        .route("/jobs/{job}/blobs/{digest}", get(files::blob))
         .route("/datasets", get(list_datasets))
         .route("/datasets/{dataset}", get(get_dataset))
+        .route("/datasets/{dataset}/inspect", post(inspect_dataset))
         .route("/caller", get(get_caller))
         .route("/workers", get(list_workers))
         .route("/tenants", get(list_tenants))
+        .route("/tokens", get(list_tokens))
         .fallback(async || Fault::not_found("there is no such call; docs/operating/http.md lists them"))
         .method_not_allowed_fallback(async || {
             let message = "this address has other methods; docs/operating/http.md lists them";
@@ -330,6 +333,24 @@ async fn get_dataset(State(web): State<Web>, At(dataset_id): At<String>, caller:
     Ok(Json(json::dataset(web.uploads().get_dataset(caller.asks(request)).await?.get_ref())))
 }
 
+#[derive(Debug, Default, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+struct Inspected {
+    /// Settings that differ from their defaults.
+    config: Option<Value>,
+}
+
+async fn inspect_dataset(
+    State(web): State<Web>,
+    At(dataset_id): At<String>,
+    caller: Caller,
+    Said(Inspected { config }): Said<Inspected>,
+) -> Answer {
+    let config_json = config.map_or_else(String::new, |config| config.to_string());
+    let request = v1::InspectDatasetRequest { dataset_id, config_json };
+    Ok(Json(json::inspection(web.uploads().inspect_dataset(caller.asks(request)).await?.get_ref())))
+}
+
 async fn get_caller(State(web): State<Web>, caller: Caller) -> Answer {
     let known = web.admin().get_caller(caller.asks(GetCallerRequest {})).await?.into_inner();
     Ok(Json(json::caller(&known)))
@@ -343,4 +364,9 @@ async fn list_workers(State(web): State<Web>, caller: Caller) -> Answer {
 async fn list_tenants(State(web): State<Web>, caller: Caller) -> Answer {
     let all = web.admin().list_tenants(caller.asks(ListTenantsRequest {})).await?.into_inner();
     Ok(Json(json!({"tenants": all.tenants.iter().map(json::tenant).collect::<Vec<_>>()})))
+}
+
+async fn list_tokens(State(web): State<Web>, caller: Caller) -> Answer {
+    let all = web.admin().list_tokens(caller.asks(ListTokensRequest {})).await?.into_inner();
+    Ok(Json(json!({"tokens": all.tokens.iter().map(json::token).collect::<Vec<_>>()})))
 }

@@ -87,6 +87,32 @@ pub async fn read(
     Ok(answer)
 }
 
+/// A blob that something of a job names by its digest: a preview, the plan, a photograph.
+pub async fn blob(
+    State(web): State<Web>,
+    At((job_id, digest)): At<(String, String)>,
+    caller: Caller,
+) -> Result<Response, Fault> {
+    let request = v1::ReadBlobRequest { digest, offset_bytes: 0, job_id, direct: false };
+    let mut pieces = web.uploads().read_blob(caller.asks(request)).await?.into_inner();
+    let first = pieces.message().await?;
+    let kind = kind_of(first.as_ref().map(|piece| piece.data.as_ref()).unwrap_or_default());
+    let mut answer = Response::new(Body::from_stream(contents(first, pieces)));
+    answer.headers_mut().insert(header::CONTENT_TYPE, HeaderValue::from_static(kind));
+    Ok(answer)
+}
+
+/// The type of a content by its first bytes: a blob has no name.
+fn kind_of(content: &[u8]) -> &'static str {
+    if content.starts_with(&[0xff, 0xd8, 0xff]) {
+        "image/jpeg"
+    } else if content.starts_with(b"\x89PNG") {
+        "image/png"
+    } else {
+        "application/octet-stream"
+    }
+}
+
 /// The bytes of a blob's pieces. The last piece is sent when the call has ended. Otherwise the server, which
 /// reads no further once it has sent all bytes, would drop the call, and it would count as cancelled.
 fn contents(

@@ -14,18 +14,19 @@ mod read;
 use std::io;
 use std::sync::Arc;
 
-use axum::Router;
 use axum::body::Body;
 use axum::extract::{Request, State};
 use axum::http::{HeaderValue, StatusCode, header};
 use axum::middleware::{Next, from_fn, from_fn_with_state};
 use axum::response::{IntoResponse, Response};
-use axum::routing::get;
+use axum::routing::{get, post};
+use axum::{Json, Router};
 use fathom_proto::admin::v1::admin_service_client::AdminServiceClient;
 use fathom_proto::v1::job_service_client::JobServiceClient;
 use fathom_proto::v1::upload_service_client::UploadServiceClient;
 use fathom_web::Refused;
 use futures::Stream;
+use serde_json::json;
 use tokio::io::{AsyncRead, AsyncWrite};
 use tonic::service::Routes;
 use tonic::transport::Server;
@@ -33,7 +34,8 @@ use tonic::transport::server::Connected;
 use tonic_web::GrpcWebLayer;
 use tower_layer::Layer;
 
-use self::answer::Fault;
+use self::answer::{Answer, Fault};
+use crate::access;
 use crate::access::guard::{Guard, Guarded};
 use crate::connections::Visit;
 use crate::metrics::rpc::Rpc;
@@ -101,6 +103,7 @@ fn router(web: Web, is_own_page: bool) -> Router {
     let calls = GrpcWebLayer::new().layer(web.door.clone());
     let mut router = Router::new()
         .nest("/api/v1", api::router().layer(from_fn_with_state(web.clone(), with_token)))
+        .route("/api/v1/enter", post(enter))
         .route("/", get(page))
         .route("/assets/{*file}", get(page))
         .route("/licences.txt", get(page))
@@ -119,23 +122,39 @@ fn router(web: Web, is_own_page: bool) -> Router {
 
 /// Refuses a request without a valid token before anything of its body is read.
 async fn with_token(State(web): State<Web>, mut request: Request, next: Next) -> Result<Response, Fault> {
-    let visit = Visit::of(&request).cloned();
+    let caller = admitted(&web, &request, |shown, now_ms| web.guard.access.principal(shown, now_ms))?;
+    request.extensions_mut().insert(caller);
+    Ok(next.run(request).await)
+}
+
+/// Exchanges the invitation in a link, which is void afterwards, for the token of a page.
+async fn enter(State(web): State<Web>, request: Request) -> Answer {
+    let token = admitted(&web, &request, |shown, now_ms| web.guard.access.enter(shown, now_ms))?;
+    Ok(Json(json!({"token": token.reveal()})))
+}
+
+/// What `look` gives for the `authorization` header of a request; otherwise counts and logs the refusal.
+fn admitted<T>(
+    web: &Web,
+    request: &Request,
+    look: impl FnOnce(Option<&str>, u64) -> Result<T, access::Refused>,
+) -> Result<T, Fault> {
+    let visit = Visit::of(request);
     let shown = request.headers().get(header::AUTHORIZATION).map(HeaderValue::to_str).transpose();
-    let caller = match shown {
-        Ok(shown) => web.guard.access.principal(shown, web.guard.clock.now_ms()),
-        Err(_) => Err(crate::access::Refused::NotValid),
+    let looked = match shown {
+        Ok(shown) => look(shown, web.guard.clock.now_ms()),
+        Err(_) => Err(access::Refused::NotValid),
     };
-    match (caller, visit) {
-        (Ok(caller), visit) => {
+    match looked {
+        Ok(found) => {
             if let Some(visit) = visit {
                 visit.admit();
             }
-            request.extensions_mut().insert(caller);
-            Ok(next.run(request).await)
+            Ok(found)
         }
-        (Err(refused), visit) => {
+        Err(refused) => {
             let error = ServiceError::from(refused);
-            web.guard.log_refusal(request.uri().path(), visit.as_ref(), &error);
+            web.guard.log_refusal(request.uri().path(), visit, &error);
             if let Some(visit) = visit {
                 visit.call_without_token();
             }

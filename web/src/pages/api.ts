@@ -7,7 +7,7 @@ import { AdminService } from '../rpc/fathom/admin/v1/admin_pb.ts';
 import { JobService } from '../rpc/fathom/v1/job_pb.ts';
 import { UploadService } from '../rpc/fathom/v1/upload_pb.ts';
 import type { Connection } from './connection.ts';
-import { type Fault, faultOf, faultOfResponse } from './faults.ts';
+import { Fault, faultOf, faultOfResponse } from './faults.ts';
 
 /** A call without an answer for this long has failed. */
 const CALL_WITHIN_MS = 20_000;
@@ -104,12 +104,40 @@ export class Api {
         }
     }
 
-    /** The content of a blob, as a job may read it. */
-    async blob(digest: string, jobId: string, signal: AbortSignal, type = 'application/octet-stream'): Promise<Blob> {
+    /** Exchanges an invitation, which is valid once, for the token of a session. */
+    async enter(invitation: string): Promise<string> {
+        try {
+            const response = await fetch(new URL('api/v1/enter', this.#base), {
+                method: 'POST',
+                headers: { authorization: `Bearer ${invitation}` },
+                cache: 'no-store',
+            });
+            if (!response.ok) {
+                throw await faultOfResponse(response);
+            }
+            const { token } = (await response.json()) as { readonly token?: unknown };
+            if (typeof token !== 'string' || token === '') {
+                throw new Fault('refused', '', 'The service gives no token for this link.');
+            }
+            this.#connection.answered();
+            return token;
+        } catch (error) {
+            // Its refusal says nothing about the token of the session.
+            throw this.#noted(error, null);
+        }
+    }
+
+    /** The content of a blob, as a job may read it. Rejects if it has more than `most` bytes. */
+    async blob(digest: string, jobId: string, signal: AbortSignal, type = 'application/octet-stream', most = Infinity): Promise<Blob> {
         try {
             const pieces: Uint8Array<ArrayBuffer>[] = [];
+            let bytes = 0;
             for await (const piece of this.uploads.readBlob({ digest, jobId }, { signal, ...NO_LIMIT })) {
                 pieces.push(piece.data as Uint8Array<ArrayBuffer>);
+                bytes += piece.data.length;
+                if (bytes > most) {
+                    throw new Fault('refused', 'TOO_LARGE', `The file ${digest} is larger than it can be.`);
+                }
             }
             return new Blob(pieces, { type });
         } catch (error) {

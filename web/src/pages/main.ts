@@ -12,7 +12,7 @@ import type { JobPage } from './job/index.ts';
 import { showJobs } from './jobs.ts';
 import { DATASETS_LINK, type Route, jobLink, jobsLink, readRoute, serviceLink } from './route.ts';
 import type { ServicePage } from './service/index.ts';
-import { Session, WORKER_TOKEN, tokenOfAddress } from './session.ts';
+import { INVITATION_REFUSED, Session, WORKER_TOKEN, tokenOfAddress } from './session.ts';
 import { capital, roleWord } from './words.ts';
 import './pages.css';
 
@@ -236,7 +236,7 @@ function show(byUser: boolean): void {
 }
 
 /**
- * A link with nothing but a token, such as that of `fathom train --web`, leads to the job if there is only
+ * A link with nothing but a token or an invitation, such as that of `fathom train --web`, leads to the job if there is only
  * one. If there is none yet, the list of jobs waits for it.
  */
 async function toOnlyJob(): Promise<void> {
@@ -267,8 +267,7 @@ async function loaded<M>(signal: AbortSignal, container: HTMLElement, fetchModul
 window.addEventListener('hashchange', () => {
     const taken = tokenOfAddress();
     if (taken !== null) {
-        session.use(taken.token);
-        session.isBareLink = taken.isBare;
+        session.take(taken);
         void begin();
     } else if (main.isConnected) {
         show(true);
@@ -308,7 +307,8 @@ function refuse(fault: Fault): void {
     const hadToken = session.token() !== null;
     if (fault.kind === 'token' || fault.reason === WORKER_TOKEN) {
         session.forget();
-        showSignIn(fault.kind !== 'token' ? fault.message : hadToken ? NOT_ACCEPTED : '');
+        const isSaid = fault.kind !== 'token' || fault.reason === INVITATION_REFUSED;
+        showSignIn(isSaid ? fault.message : hadToken ? NOT_ACCEPTED : '');
         return;
     }
     const again = h('button', { type: 'button', onclick: () => void begin() }, 'Try again');

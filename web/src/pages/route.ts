@@ -104,6 +104,8 @@ export const shareLink = (page: string, job: string, token: string): string =>
 
 export interface TakenToken {
     readonly token: string;
+    /** Whether it is an invitation: valid once, and to be exchanged for a token. */
+    readonly isInvitation: boolean;
     /** The fragment without it. */
     readonly rest: string;
     /** Whether the link names no page: it leads to the only job, or to the list of them. */
@@ -111,22 +113,27 @@ export interface TakenToken {
 }
 
 /**
- * The token that a fragment carries, and the fragment without it. Two forms are read: `#/jobs/ID?token=...`
- * and `#token=...&job=ID`.
+ * The token or invitation that a fragment carries, and the fragment without it. Two forms are read:
+ * `#/jobs/ID?token=...` and `#token=...&job=ID`, each also with `invitation`.
  */
 export function takeToken(fragment: string): TakenToken | null {
     const text = fragment.replace(/^#/, '');
     const isPath = text.startsWith('/');
     const [path = '', query = ''] = isPath ? text.split('?', 2) : ['', text];
     const asked = new URLSearchParams(query);
-    const token = asked.get('token')?.trim() ?? '';
+    const invitation = asked.get('invitation')?.trim() ?? '';
+    const isInvitation = invitation !== '';
+    const token = isInvitation ? invitation : (asked.get('token')?.trim() ?? '');
     if (token === '') {
         return null;
     }
     if (!isPath) {
         const job = asked.get('job') ?? '';
-        return { token, rest: job === '' ? jobsLink() : jobLink(job), isBare: job === '' };
+        return { token, isInvitation, rest: job === '' ? jobsLink() : jobLink(job), isBare: job === '' };
     }
+    // Both are removed, so that neither stays in the address.
+    asked.delete('invitation');
     asked.delete('token');
-    return { token, rest: `#${path}${asked.size === 0 ? '' : `?${asked.toString()}`}`, isBare: false };
+    const rest = `#${path}${asked.size === 0 ? '' : `?${asked.toString()}`}`;
+    return { token, isInvitation, rest, isBare: false };
 }

@@ -152,7 +152,7 @@ export class Thumbnails {
                 return null;
             }
             // It may be deleted: then a final render.
-            const content = digest === '' ? null : await session.api.blob(digest, jobId, signal, 'image/jpeg').catch(() => null);
+            const content = digest === '' ? null : await session.api.blob(digest, jobId, signal, 'image/jpeg', MOST_BYTES).catch(() => null);
             if (content !== null) {
                 const whole = await createImageBitmap(content);
                 return { digest, picture: fitted(whole, 0, whole.width) };

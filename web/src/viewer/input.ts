@@ -14,6 +14,8 @@ export interface Asked {
     click(x: number, y: number): void;
     /** A double click or tap. */
     pick(x: number, y: number): void;
+    /** As a double click in the middle of the picture. */
+    pickMiddle(): void;
     reset(): void;
     /** To the next (1) or previous (-1) photograph. */
     photograph(step: number): void;
@@ -149,6 +151,9 @@ export class Input {
         } else if (event.code === 'KeyR' || event.code === 'Home') {
             event.preventDefault();
             this.#asked.reset();
+        } else if (event.code === 'KeyF') {
+            event.preventDefault();
+            this.#asked.pickMiddle();
         } else if (event.code === 'PageDown' || event.code === 'PageUp') {
             event.preventDefault();
             this.#asked.photograph(event.code === 'PageDown' ? 1 : -1);

@@ -25,6 +25,7 @@ const KEYS: readonly (readonly [string, string])[] = [
     ['W A S D, Q E', 'move, down and up; Shift is faster'],
     ['Arrow keys', 'turn'],
     ['+ −', 'nearer, farther'],
+    ['F', 'turn about what is in the middle'],
     ['Page up, Page down', 'other photographs'],
     ['R', 'first view'],
 ];

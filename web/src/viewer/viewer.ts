@@ -152,6 +152,10 @@ export class Viewer {
             },
             click: (x, y) => this.#clickCamera(x, y),
             pick: (x, y) => void this.#pickPivot(x, y),
+            pickMiddle: () => {
+                const { x, y, width, height } = this.area();
+                void this.#pickPivot(x + width / 2, y + height / 2);
+            },
             reset: () => this.reset(),
             photograph: (step) => this.stepPhotograph(step),
         });
@@ -488,7 +492,7 @@ export class Viewer {
         }
     }
 
-    /** A double click chooses the point that an orbit turns about. */
+    /** Chooses the point that an orbit turns about: what is seen at this place of the canvas. */
     async #pickPivot(x: number, y: number): Promise<void> {
         const area = this.area();
         const camera = this.#screenCamera();

@@ -22,7 +22,10 @@ export async function launch(flags: readonly string[] = FLAGS): Promise<Browser>
     return chromium.launch({ executablePath, args: [...flags], headless: true });
 }
 
-/** A page that collects what the console and the policy complain about. */
+/** A token in an address: servers and proxies write addresses to their logs. */
+const TOKEN = /fathom_[0-9a-f]+/;
+
+/** A page that collects what the console and the policy complain about, and addresses that hold a token. */
 export async function newPage(
     browser: Browser,
     options: BrowserContextOptions = {},
@@ -36,5 +39,12 @@ export async function newPage(
         }
     });
     page.on('pageerror', (error) => complaints.push(String(error)));
+    context.on('request', (request) => {
+        // No fragment is sent, so a link may carry a token there.
+        const [sent = ''] = request.url().split('#');
+        if (TOKEN.test(decodeURIComponent(sent)) || TOKEN.test(request.headers()['referer'] ?? '')) {
+            complaints.push(`a token in an address: ${request.method()} ${new URL(sent).pathname}`);
+        }
+    });
     return { page, complaints };
 }

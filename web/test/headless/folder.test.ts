@@ -24,6 +24,7 @@ import { createClient } from '@connectrpc/connect';
 import { createGrpcWebTransport } from '@connectrpc/connect-web';
 
 import { UploadService } from '../../src/rpc/fathom/v1/upload_pb.ts';
+import { sentence } from '../../src/pages/format.ts';
 import { launch } from './browser.ts';
 import { type JobJson, Service, serveWith } from './service.ts';
 import { type Opened, accessible, finish, fitsWindow, openAs, sleep, until } from './steps.ts';
@@ -113,6 +114,13 @@ async function agrees(page: Page, said: InspectJson): Promise<void> {
     assert.equal(
         shown.get('Seen by fewer than two views'),
         `${(100 * said.unseen).toFixed(1)} % of what the held-out views show`,
+    );
+    // What few views see is a fact here, and only a service knows that it has no workers.
+    const warnings = said.warnings.filter((text) => !text.includes('is in fewer than two training views'));
+    const shownWarnings = await page.locator('.plan-check-warnings li').allTextContents();
+    assert.deepEqual(
+        shownWarnings.filter((text) => !text.startsWith('No worker was connected')),
+        warnings.map(sentence),
     );
     const canvas = page.getByRole('application', { name: `Map of ${said.plan.partitions.length} partition` });
     await canvas.waitFor();
@@ -516,6 +524,7 @@ test(
             '48',
         ];
         const said = inspect(data, ...flags);
+        assert.ok(said.warnings.some((text) => text.includes('tend to overfit')), 'a warning to be shown');
         await page.locator('.plan-check-facts').waitFor();
         await agrees(page, said);
         await page.getByText('The settings have changed since this check.').waitFor({ state: 'hidden' });

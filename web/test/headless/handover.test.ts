@@ -14,6 +14,7 @@ import type { CameraEntry, Mode } from '../../src/viewer/index.ts';
 import { SMALL_WINDOW, WINDOW, launch, newPage } from './browser.ts';
 import { type Picture, decodePng, psnr, readPng } from './pictures.ts';
 import { serve } from './server.ts';
+import { accessible, fitsWindow } from './steps.ts';
 
 const WEB = join(import.meta.dirname, '../..');
 const DATA = process.env['VIEWER_DATA'] ?? join(WEB, 'test-data');
@@ -144,6 +145,27 @@ test('the page begins with the view of a link and offers the views kept in it', 
     await page.getByRole('button', { name: 'Bow <1>', exact: true }).click();
     assert.ok(await page.getByRole('radio', { name: 'Under water' }).isChecked());
     assert.ok(psnr(await screen(page), first) < 30);
+    assert.deepEqual(complaints, []);
+    await page.context().close();
+});
+
+test('nothing is wrong with the page for people who cannot see or point, in light and dark', TIMEOUT, async () => {
+    const { page, complaints } = await newPage(browser);
+    await page.goto(pathToFileURL(PAGE).href);
+    await waitForViewer(page);
+    await page.getByRole('button', { name: 'Compare with the photograph' }).scrollIntoViewIfNeeded();
+    await page.getByRole('button', { name: 'View 2', exact: true }).click();
+    await page.getByLabel('Compare with', { exact: true }).selectOption('photograph');
+    await page.getByText('Mouse, touch and keys').click();
+    for (const colorScheme of ['light', 'dark'] as const) {
+        for (const [size, viewport] of Object.entries({ wide: WINDOW, phone: { width: 360, height: 640 } })) {
+            await page.emulateMedia({ colorScheme });
+            await page.setViewportSize(viewport);
+            await screen(page);
+            await accessible(page, `the page, ${size}, ${colorScheme}`);
+            await fitsWindow(page, `the page, ${size}, ${colorScheme}`);
+        }
+    }
     assert.deepEqual(complaints, []);
     await page.context().close();
 });

@@ -5,7 +5,7 @@ import type { AddressInfo } from 'node:net';
 
 import { type DescMessage, type MessageInitShape, create, fromBinary, toBinary } from '@bufbuild/protobuf';
 
-import { CallerSchema, Role } from '../../src/rpc/fathom/admin/v1/admin_pb.ts';
+import { CallerSchema, ListWorkersResponseSchema, Role } from '../../src/rpc/fathom/admin/v1/admin_pb.ts';
 import {
     HistorySchema,
     JobEventSchema,
@@ -25,6 +25,15 @@ export interface Told {
     readonly blobs: Map<string, Buffer>;
     /** Files of the job, by path. */
     readonly files: Map<string, Buffer>;
+    /** The role of who uses the page; a viewer unless it is given. */
+    role?: Role;
+    workers?: MessageInitShape<typeof ListWorkersResponseSchema>['workers'];
+    /** What `api/v1/enter` takes once, for the token "session". Once it is given, calls need that token. */
+    invitation?: string;
+    /** Sizes of files that the service states in place of their true ones, by path. */
+    readonly sizes: Map<string, number>;
+    /** Paths of files that it lists and does not give. */
+    readonly refused: Set<string>;
 }
 
 export interface MadeUp {
@@ -32,10 +41,13 @@ export interface MadeUp {
     readonly told: Told;
     /** Digests of the blobs that were read, in order. */
     readonly read: string[];
+    /** Paths of the files that were asked for, in order. */
+    readonly asked: string[];
     close(): void;
 }
 
 const NOT_FOUND = 5;
+const UNAUTHENTICATED = 16;
 
 function framed<D extends DescMessage>(schema: D, content: MessageInitShape<D>): Buffer {
     const body = toBinary(schema, create(schema, content));
@@ -54,10 +66,22 @@ function trailer(status: number): Buffer {
 
 /** Serves the built pages before a made-up service. */
 export async function serveMadeUp(dist: string): Promise<MadeUp> {
-    const told: Told = { job: {}, history: {}, events: [], blobs: new Map(), files: new Map() };
+    const told: Told = {
+        job: {},
+        history: {},
+        events: [],
+        blobs: new Map(),
+        files: new Map(),
+        sizes: new Map(),
+        refused: new Set(),
+    };
     const read: string[] = [];
+    const askedFor: string[] = [];
     const answers: Readonly<Record<string, (asked: Buffer) => readonly Buffer[] | null>> = {
-        GetCaller: () => [framed(CallerSchema, { name: 'ada', role: Role.VIEWER, tokensRequired: true })],
+        GetCaller: () => [
+            framed(CallerSchema, { name: 'ada', role: told.role ?? Role.VIEWER, tokensRequired: true }),
+        ],
+        ListWorkers: () => [framed(ListWorkersResponseSchema, { workers: told.workers ?? [] })],
         ListJobs: () => [framed(ListJobsResponseSchema, { jobs: [told.job] })],
         GetJob: () => [framed(JobSchema, told.job)],
         GetHistory: () => [framed(HistorySchema, told.history)],
@@ -65,7 +89,7 @@ export async function serveMadeUp(dist: string): Promise<MadeUp> {
         ListArtifacts: () => {
             const artifacts = [...told.files].map(([path, content]) => ({
                 path,
-                blob: { digest: path, sizeBytes: BigInt(content.length) },
+                blob: { digest: path, sizeBytes: BigInt(told.sizes.get(path) ?? content.length) },
             }));
             return [framed(ListArtifactsResponseSchema, { artifacts })];
         },
@@ -80,9 +104,21 @@ export async function serveMadeUp(dist: string): Promise<MadeUp> {
     };
     const service = createServer((asked, response) => {
         const { pathname } = new URL(asked.url ?? '', 'http://x');
+        const { authorization } = asked.headers;
+        if (pathname === '/api/v1/enter') {
+            const isValid = told.invitation !== undefined && authorization === `Bearer ${told.invitation}`;
+            if (isValid) {
+                told.invitation = 'another';
+            }
+            response.writeHead(isValid ? 200 : 401, { 'content-type': 'application/json' });
+            response.end(JSON.stringify(isValid ? { token: 'session' } : { error: { reason: 'TOKEN_REFUSED' } }));
+            return;
+        }
         const file = /^\/api\/v1\/jobs\/[^/]+\/files\/(.*)$/.exec(pathname);
         if (file !== null) {
-            const content = told.files.get(decodeURIComponent(file[1] ?? ''));
+            const path = decodeURIComponent(file[1] ?? '');
+            askedFor.push(path);
+            const content = told.refused.has(path) ? undefined : told.files.get(path);
             response.writeHead(content === undefined ? 404 : 200).end(content);
             return;
         }
@@ -90,8 +126,12 @@ export async function serveMadeUp(dist: string): Promise<MadeUp> {
         const pieces: Buffer[] = [];
         asked.on('data', (piece: Buffer) => pieces.push(piece));
         asked.on('end', () => {
-            const answer = answers[method]?.(Buffer.concat(pieces)) ?? null;
             response.writeHead(200, { 'content-type': 'application/grpc-web+proto' });
+            if (told.invitation !== undefined && authorization !== 'Bearer session') {
+                response.end(trailer(UNAUTHENTICATED));
+                return;
+            }
+            const answer = answers[method]?.(Buffer.concat(pieces)) ?? null;
             response.write(Buffer.concat(answer ?? []));
             if (answer === null) {
                 response.end(trailer(NOT_FOUND));
@@ -107,6 +147,7 @@ export async function serveMadeUp(dist: string): Promise<MadeUp> {
         address: serving.address,
         told,
         read,
+        asked: askedFor,
         close: () => {
             serving.close();
             service.closeAllConnections();

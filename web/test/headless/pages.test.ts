@@ -11,7 +11,9 @@ import { join } from 'node:path';
 import { after, before, test } from 'node:test';
 import type { Browser, BrowserContextOptions, Locator, Page } from 'playwright-core';
 
+import { brief } from '../../src/pages/parts/format.ts';
 import { launch, newPage } from './browser.ts';
+import { type Picture, psnr } from './pictures.ts';
 import { type JobJson, Service, serveWith } from './service.ts';
 import { type Opened, accessible, finish as finishAll, fitsWindow, openAs, sleep, until } from './steps.ts';
 
@@ -20,6 +22,23 @@ const PAGES = process.env['PAGES'] ?? join(import.meta.dirname, '../../dist');
 const skip = FATHOM === '' ? 'FATHOM does not name the program' : false;
 const SETTINGS = ['--partitions', '2x2', '--iterations', '160', '--max-gaussians', '1000'];
 const TIMEOUT = { timeout: 60_000 };
+
+/** So many lines of a log are compared: elements of their own are those in sight. */
+const FIRST_LINES = 12;
+
+type Three<T> = readonly [T, T, T];
+interface WaterJson {
+    readonly beta_d: Three<number>;
+    readonly beta_b: Three<number>;
+    readonly b_inf: Three<number>;
+    readonly standard_error: Readonly<Record<'beta_d' | 'beta_b' | 'b_inf', Three<number | null> | null>> | null;
+}
+
+interface LogLine {
+    readonly task: string;
+    readonly level: string;
+    readonly message: string;
+}
 
 let folder = '';
 let data = '';
@@ -125,6 +144,20 @@ test('a job appears in the list with what it waits for', { skip, ...TIMEOUT }, a
     await finish(page, complaints);
 });
 
+test('the queue names what a waiting job lacks', { skip, ...TIMEOUT }, async () => {
+    const { page, complaints } = await open('#/service/queue', service.operator);
+    const row = page.getByRole('row', { name: 'Reef & wreck <1>' });
+    const { waiting_reason: reason, priority } = await jobOf(reef);
+    assert.ok(reason);
+    const cells = row.locator('th, td');
+    await until('what is lacking', async () => (await textOf(cells.last())).startsWith(`${reason} (`));
+    const [name, state, , , tenant, shownPriority] = await cells.allTextContents();
+    assert.deepEqual([name, state, tenant, shownPriority], ['Reef & wreck <1>', 'Waiting', 'reef', String(priority)]);
+    await page.getByText('1 open job, 1 waiting for a worker').waitFor();
+    await accessible(page, 'a queue');
+    await finish(page, complaints);
+});
+
 test('another tenant does not find the job, and a viewer cannot change it', { skip, ...TIMEOUT }, async () => {
     const other = await open(`#/jobs/${reef}`, tokens.otto);
     await other.page.getByRole('heading', { name: 'Job not found' }).waitFor();
@@ -226,20 +259,48 @@ test('the sections of a job show its log, files, settings and pictures', { skip,
     await accessible(page, 'the overview of a job that has ended');
 
     await section('Log');
-    const { lines } = await service.api<{ lines: { message: string; level: string }[] }>(tokens.vera, `jobs/${reef}/logs?limit=10000`);
+    const { lines } = await service.api<{ lines: LogLine[] }>(tokens.vera, `jobs/${reef}/logs?limit=10000`);
     await page.getByText(new RegExp(`^${lines.length} lines$`)).waitFor();
     const last = page.locator('.log-line').last();
     await until('the last line is in sight', async () => (await textOf(last.locator('.log-message'))) === lines.at(-1)?.message);
     await page.getByLabel('Level').selectOption('Warnings and errors');
     const warnings = lines.filter(({ level }) => level === 'warn' || level === 'error').length;
     await page.getByText(`${warnings} of ${lines.length} lines`).waitFor();
+    await page.getByLabel('Level').selectOption('All');
+    const shownLines = (): Promise<string[]> => page.locator('.log-line .log-message').allTextContents();
+    const inSight = async (wanted: readonly LogLine[], what: string): Promise<void> => {
+        assert.ok(wanted.length > 0 && wanted.length < lines.length, `${what}: ${wanted.length} of ${lines.length} lines`);
+        await page.getByText(`${wanted.length} of ${lines.length} lines`, { exact: true }).waitFor();
+        await page.locator('.log').evaluate((log) => (log.scrollTop = 0));
+        const most = wanted.slice(0, FIRST_LINES).map(({ message }) => message);
+        await until(what, async () => JSON.stringify((await shownLines()).slice(0, FIRST_LINES)) === JSON.stringify(most), 5).catch(() => {});
+        assert.deepEqual((await shownLines()).slice(0, FIRST_LINES), most, what);
+    };
+    for (const task of new Set(lines.map((line) => line.task))) {
+        await page.getByLabel('Task', { exact: true }).selectOption(task);
+        await inSight(lines.filter((line) => line.task === task), task);
+    }
+    await page.getByLabel('Task', { exact: true }).selectOption('All tasks');
+    // Capitals do not matter. Of the words of the log, one that not every line has.
+    const wordOf = ({ message }: LogLine): string => /[a-z]{5,}/.exec(message)?.[0] ?? '';
+    const having = (word: string): readonly LogLine[] => lines.filter(({ message }) => message.toLowerCase().includes(word));
+    const word = lines.map(wordOf).find((one) => one !== '' && having(one).length < lines.length) ?? '';
+    await page.getByLabel('Message contains').fill(word.toUpperCase());
+    await inSight(having(word), word);
+    const [{ task: taskOfWord }] = having(word) as [LogLine];
+    await page.getByLabel('Task', { exact: true }).selectOption(taskOfWord);
+    await inSight(having(word).filter(({ task }) => task === taskOfWord), `${word} of ${taskOfWord}`);
+    await page.getByLabel('Message contains').fill('no line has these words');
+    await page.getByText(`0 of ${lines.length} lines`).waitFor();
+    assert.deepEqual(await shownLines(), []);
     await accessible(page, 'the log');
 
     await section('Files');
     const { files } = await service.api<{ files: { path: string; bytes: number; digest: string }[] }>(tokens.vera, `jobs/${reef}/files`);
     await page.getByText('Pictures of held-out views').click();
-    const names = await page.locator('.files .name .mono').allTextContents();
-    assert.deepEqual(names.toSorted(), files.map(({ path }) => path).toSorted());
+    const names = page.locator('.files .name .mono');
+    await until('the pictures are listed too', async () => (await names.count()) === files.length, 5).catch(() => {});
+    assert.deepEqual((await names.allTextContents()).toSorted(), files.map(({ path }) => path).toSorted());
     const downloading = page.waitForEvent('download');
     await page.getByRole('button', { name: 'Download model.ply' }).click();
     const download = await downloading;
@@ -255,16 +316,32 @@ test('the sections of a job show its log, files, settings and pictures', { skip,
 
     await section('Water');
     await page.getByRole('heading', { name: 'Attenuation of direct light' }).waitFor();
+    const water = await service.api<WaterJson>(tokens.vera, `jobs/${reef}/files/water.json`);
+    const errors: (number | null)[] = [];
+    for (const parameter of ['beta_d', 'beta_b', 'b_inf'] as const) {
+        const rows = page.locator('.fp-water-parameter').filter({ has: page.locator('code', { hasText: parameter }) }).locator('tbody tr');
+        const shown = await rows.evaluateAll((all) => all.map((row) => [...row.children].slice(0, 3).map(({ textContent }) => textContent)));
+        const expected = ['Red', 'Green', 'Blue'].map((channel, at) => {
+            const error = water.standard_error?.[parameter]?.[at] ?? null;
+            errors.push(error);
+            return [channel, brief(water[parameter][at]!), error === null ? '–' : brief(error, 2)];
+        });
+        assert.deepEqual(shown, expected, parameter);
+    }
+    assert.ok(errors.some((error) => error !== null), 'an error is known');
     await accessible(page, 'the water');
 
     await section('Views');
     await until('a picture is shown', () =>
         page.evaluate(() => [...document.querySelectorAll<HTMLImageElement>('.section img')].some(({ naturalWidth }) => naturalWidth > 0)),
     );
-    const metrics = await service.api<{ views: { name: string }[] }>(tokens.vera, `jobs/${reef}/files/metrics.json`);
-    for (const { name } of metrics.views) {
-        assert.ok((await page.locator('.section').textContent())?.includes(name), name);
-    }
+    const metrics = await service.api<{ views: { name: string; psnr: number }[] }>(tokens.vera, `jobs/${reef}/files/metrics.json`);
+    const worstFirst = metrics.views.toSorted((a, b) => a.psnr - b.psnr);
+    assert.ok(worstFirst.length > 1);
+    const entries = await page
+        .locator('.fp-compare-list .fp-compare-words')
+        .evaluateAll((all) => all.map(({ children }) => [...children].map(({ textContent }) => textContent)));
+    assert.deepEqual(entries, worstFirst.map((view) => [view.name, `${view.psnr.toFixed(2)} dB`]));
     await accessible(page, 'the held-out views');
 
     await section('Curves');
@@ -277,6 +354,23 @@ test('the sections of a job show its log, files, settings and pictures', { skip,
         .then((handle) => handle.jsonValue());
     const { gaussians: expected } = await service.api<{ gaussians: number }>(tokens.vera, `jobs/${reef}/files/metrics.json`);
     assert.equal(gaussians, expected);
+    const taken = async (mode: 'clear' | 'water'): Promise<Picture> => {
+        const size = { width: 96, height: 72 };
+        const pixels = await page.evaluate(
+            async ({ width, height, shown }) => {
+                const viewer = document.querySelector<HTMLElement>('.viewer-host')!.fathomViewer!;
+                return [...(await viewer.picture({ width, height, mode: shown })).data];
+            },
+            { ...size, shown: mode },
+        );
+        return { ...size, data: Uint8Array.from(pixels) };
+    };
+    const [clear, under] = [await taken('clear'), await taken('water')];
+    for (const one of [clear, under]) {
+        assert.ok(new Set(one.data).size > 40, 'a picture of something');
+    }
+    const apart = psnr(clear, under);
+    assert.ok(apart < 25, `the water changes the picture: ${apart} dB`);
     await accessible(page, 'the viewer');
     // Chromium says so when it draws on the CPU.
     await finish(page, complaints, /GPU stall|WebGL/);

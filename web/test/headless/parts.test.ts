@@ -12,16 +12,13 @@ import { PNG } from 'pngjs';
 import { JobState, Stage, TaskState } from '../../src/rpc/fathom/v1/job_pb.ts';
 import { launch } from './browser.ts';
 import { type MadeUp, json, serveMadeUp } from './made-up.ts';
-import { type Opened, accessible, finish, fitsWindow, openAs } from './steps.ts';
+import { type Opened, finish, looksRight, openAs } from './steps.ts';
 
 const PAGES = process.env['PAGES'] ?? join(import.meta.dirname, '../../dist');
 const TIMEOUT = { timeout: 60_000 };
 /** Without a graphics card the viewer draws slowly. */
 const LONG_TIMEOUT = { timeout: 180_000 };
-const PHONE = { width: 390, height: 800 };
 const NOW = Date.now();
-/** A folder for pictures of what a test saw, for people. */
-const SHOTS = process.env['SHOTS'] ?? '';
 
 let browser: Browser;
 let service: MadeUp;
@@ -47,28 +44,6 @@ const JOB = {
 };
 
 const open = (section: string): Promise<Opened> => openAs(browser, `${service.address}/#/jobs/7${section}`);
-
-/** Nothing is wrong with a page in light and dark, on a screen and on a phone. */
-async function looksRight({ page }: Opened, name: string): Promise<void> {
-    for (const colorScheme of ['light', 'dark'] as const) {
-        await page.emulateMedia({ colorScheme });
-        for (const [size, viewport] of Object.entries({ wide: { width: 1200, height: 850 }, phone: PHONE })) {
-            await page.setViewportSize(viewport);
-            // Charts follow the size of the window.
-            await page.waitForTimeout(200);
-            await fitsWindow(page, `${name}, ${size}, ${colorScheme}`);
-            await accessible(page, `${name}, ${size}, ${colorScheme}`);
-            if (SHOTS !== '') {
-                await page.screenshot({
-                    path: join(SHOTS, `${name}-${size}-${colorScheme}.png`),
-                    fullPage: true,
-                });
-            }
-        }
-    }
-    await page.setViewportSize({ width: 1200, height: 850 });
-    await page.emulateMedia({ colorScheme: 'light' });
-}
 
 const rgb = (red: number, green: number, blue: number) => ({ red, green, blue });
 
@@ -101,7 +76,8 @@ const firstParts = Array.from({ length: 4 }, (_, index) => ({
 }));
 
 test('the water is shown while it settles, with the spread between partitions', TIMEOUT, async () => {
-    service.told.job = { ...JOB, tasks: firstParts };
+    service.told.blobs.set('plan', json({ extent: { viewing_distance: 4.7 } }));
+    service.told.job = { ...JOB, plan: { digest: 'plan', sizeBytes: 1n }, tasks: firstParts };
     service.told.history = { tasks: [] };
     const opened = await open('/water');
     const { page } = opened;
@@ -111,7 +87,15 @@ test('the water is shown while it settles, with the spread between partitions', 
     assert.equal(await page.locator('.fp-curve canvas').count(), 3);
     const expected = waterAt(0, 19 / 40).betaD.red.toPrecision(3);
     await page.locator('.fp-curve').first().getByText(expected).waitFor();
-    await page.getByText('Thin lines: 3 other tasks of this stage.').waitFor();
+    await page.getByText('Bands: lowest to highest of 4 tasks of this stage, dashed: their mean.').waitFor();
+    // Before the job has succeeded, the latest water is shown by what it does to colours.
+    const colours = page.locator('.fp-water-colours');
+    await colours.getByText('The latest water of First part of partition 0, at iteration 1,900.').waitFor();
+    await colours.getByText('the median depth of the scene in the photographs').waitFor();
+    assert.deepEqual(
+        (await colours.locator('thead th').allTextContents()).map((text) => text.split(' ').slice(0, 2).join(' ')),
+        ['In air', '1 ×', '3 ×', '10 ×', 'Open water'],
+    );
     // The values of partition 3 are 15 % above those of partition 0, of a mean of 1.075 times the latter.
     assert.equal(await page.locator('.fp-water-spread').getByText('14 % apart').count(), 9);
     await page.getByLabel('Water of').selectOption('First part of partition 2');
@@ -195,6 +179,7 @@ test('the overview says what bounds the job, and where its time went', TIMEOUT, 
         fetchingSeconds: 25,
         trainingSeconds: 470,
         photographsSeconds: 15,
+        diskSeconds: 6,
         watchingSeconds: 10,
     };
     const point = {
@@ -215,7 +200,8 @@ test('the overview says what bounds the job, and where its time went', TIMEOUT, 
         items.map((text) => text.split(':')[0]),
         [
             'Training',
-            'Waiting for photographs',
+            'Reading photographs from disk',
+            'Decoding photographs',
             'Fetching input, sending results',
             'Measuring, previews, checkpoints',
             'Work of the coordinator',
@@ -535,4 +521,79 @@ test('a model that is gone is told, and the viewer stays with what it has', TIME
     assert.deepEqual(await seenAt(page, IN_CELLS), ['none', 'none', 'red', 'none']);
     await page.getByRole('button', { name: 'Show it' }).waitFor();
     await finish(opened);
+});
+
+/** How often a file of the job was asked for. */
+const timesAsked = (path: string): number => service.asked.filter((asked) => asked === path).length;
+
+/** A finished job whose model is red and whose copy is blue, with the sizes that the service states. */
+function finishedWith(modelBytes: number | null, copyBytes: number | null): void {
+    service.told.job = { ...JOB, state: JobState.SUCCEEDED, progress: 1, tasks: [] };
+    service.told.files
+        .set('plan.json', json(PLAN))
+        .set('cameras.json', json(CAMERAS))
+        .set('water.json', json(WATER))
+        .set('model.ply', carpet('red'))
+        .set('model.compressed.ply', carpet('blue'));
+    service.told.refused.clear();
+    service.told.sizes.clear();
+    if (modelBytes !== null && copyBytes !== null) {
+        service.told.sizes.set('model.ply', modelBytes).set('model.compressed.ply', copyBytes);
+    }
+    service.asked.length = 0;
+}
+
+const waitForViewer = (page: Page): Promise<unknown> =>
+    page.waitForFunction(() => document.querySelector<HTMLElement>('.viewer-host')?.fathomViewer);
+
+const COPY_LINE = 'A copy for viewing: 61.0 MB instead of 248 MB.';
+
+test('of a large finished model the copy is seen first, and the whole model on request', LONG_TIMEOUT, async () => {
+    finishedWith(248e6, 61e6);
+    const opened = await open('/viewer');
+    const { page } = opened;
+    await page.getByText(COPY_LINE, { exact: true }).waitFor();
+    await waitForViewer(page);
+    assert.deepEqual(await seenAt(page, IN_CELLS), ['blue', 'blue', 'blue', 'blue']);
+    assert.deepEqual([timesAsked('model.compressed.ply'), timesAsked('model.ply')], [1, 0]);
+    await looksRight(opened, 'viewer-copy');
+    const whole = page.getByRole('button', { name: 'Load the whole model' });
+
+    // Refused: what was seen stays, and it can be tried again.
+    service.told.refused.add('model.ply');
+    await whole.click();
+    await page.getByText('The whole model cannot be shown.').waitFor();
+    await page.getByText(COPY_LINE, { exact: true }).waitFor();
+    await page.waitForFunction(
+        () => ![...document.querySelectorAll('button')].some(({ textContent, disabled }) =>
+            disabled && textContent === 'Load the whole model'),
+    );
+    assert.deepEqual(await seenAt(page, IN_CELLS), ['blue', 'blue', 'blue', 'blue']);
+    const refusals = timesAsked('model.ply');
+    assert.ok(refusals >= 1);
+
+    service.told.refused.clear();
+    await whole.click();
+    await page.getByText(COPY_LINE, { exact: true }).waitFor({ state: 'hidden' });
+    assert.deepEqual(await seenAt(page, IN_CELLS), ['red', 'red', 'red', 'red']);
+    assert.ok(await whole.isHidden());
+    assert.deepEqual([timesAsked('model.compressed.ply'), timesAsked('model.ply')], [1, refusals + 1]);
+    await finish(opened, /404/);
+});
+
+test('a small finished model is loaded itself, and a huge copy only after a question', TIMEOUT, async () => {
+    finishedWith(null, null);
+    const small = await open('/viewer');
+    await waitForViewer(small.page);
+    assert.deepEqual(await seenAt(small.page, IN_CELLS), ['red', 'red', 'red', 'red']);
+    assert.deepEqual([timesAsked('model.compressed.ply'), timesAsked('model.ply')], [0, 1]);
+    assert.equal(await small.page.getByText('A copy for viewing').isVisible(), false);
+    assert.equal(await small.page.getByRole('button', { name: 'Load the whole model' }).isVisible(), false);
+    await finish(small);
+
+    finishedWith(800e6, 200e6);
+    const huge = await open('/viewer');
+    await huge.page.getByRole('button', { name: 'Load the model (200 MB)' }).waitFor();
+    assert.deepEqual([timesAsked('model.compressed.ply'), timesAsked('model.ply')], [0, 0]);
+    await finish(huge);
 });

@@ -2,7 +2,7 @@
 // built pages, so that the pages are those of this working tree.
 
 import { type ChildProcess, execFileSync, spawn } from 'node:child_process';
-import { existsSync, readFileSync, statSync } from 'node:fs';
+import { closeSync, existsSync, openSync, readFileSync, statSync } from 'node:fs';
 import { type IncomingMessage, type ServerResponse, createServer, request } from 'node:http';
 import { type AddressInfo, createServer as createTcp } from 'node:net';
 import { extname, join, normalize } from 'node:path';
@@ -85,11 +85,22 @@ export class Service {
         return readFileSync(join(this.folder, 'data', 'operator.token'), 'utf8').trim();
     }
 
+    /** What the coordinator logs. */
+    get logPath(): string {
+        return join(this.folder, 'coordinator.log');
+    }
+
+    get coordinatorPid(): number {
+        return this.#coordinator!.pid!;
+    }
+
     async startCoordinator(): Promise<void> {
         const [grpc, web] = [`127.0.0.1:${this.grpcPort}`, `127.0.0.1:${this.webPort}`];
         const data = join(this.folder, 'data');
         const flags = ['--data-dir', data, '--listen', grpc, '--web', web, '--tokens'];
-        this.#coordinator = spawn(this.fathom, ['coordinator', ...flags], { stdio: 'ignore' });
+        const log = openSync(this.logPath, 'a');
+        this.#coordinator = spawn(this.fathom, ['coordinator', ...flags], { stdio: ['ignore', log, log] });
+        closeSync(log);
         const until = Date.now() + START_MS;
         // Any answer will do; without a token it is a refusal.
         while (!(await fetch(`http://${web}/api/v1/jobs`).then(() => true, () => false))) {

@@ -3,11 +3,16 @@
 import assert from 'node:assert/strict';
 import { readFileSync } from 'node:fs';
 import { createRequire } from 'node:module';
+import { join } from 'node:path';
 import type { Browser, BrowserContextOptions, Page } from 'playwright-core';
 
 import { newPage } from './browser.ts';
 
 const AXE = readFileSync(createRequire(import.meta.url).resolve('axe-core/axe.min.js'), 'utf8');
+
+const PHONE = { width: 390, height: 800 };
+/** A folder for pictures of what a test saw, for people. */
+const SHOTS = process.env['SHOTS'] ?? '';
 
 export interface Opened {
     readonly page: Page;
@@ -59,6 +64,28 @@ export async function accessible(page: Page, what: string): Promise<void> {
 export async function fitsWindow(page: Page, what: string): Promise<void> {
     const [wide, shown] = await page.evaluate(() => [document.documentElement.scrollWidth, document.documentElement.clientWidth]);
     assert.ok(wide! <= shown!, `${what}: ${wide} of ${shown} pixels`);
+}
+
+/** Nothing is wrong with a page in light and dark, on a screen and on a phone. */
+export async function looksRight({ page }: Opened, name: string): Promise<void> {
+    for (const colorScheme of ['light', 'dark'] as const) {
+        await page.emulateMedia({ colorScheme });
+        for (const [size, viewport] of Object.entries({ wide: { width: 1200, height: 850 }, phone: PHONE })) {
+            await page.setViewportSize(viewport);
+            // Charts follow the size of the window.
+            await page.waitForTimeout(200);
+            await fitsWindow(page, `${name}, ${size}, ${colorScheme}`);
+            await accessible(page, `${name}, ${size}, ${colorScheme}`);
+            if (SHOTS !== '') {
+                await page.screenshot({
+                    path: join(SHOTS, `${name}-${size}-${colorScheme}.png`),
+                    fullPage: true,
+                });
+            }
+        }
+    }
+    await page.setViewportSize({ width: 1200, height: 850 });
+    await page.emulateMedia({ colorScheme: 'light' });
 }
 
 export async function finish({ page, complaints }: Opened, allowed: RegExp | null = null): Promise<void> {

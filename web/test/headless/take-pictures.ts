@@ -3,7 +3,7 @@
 //
 //     FATHOM=PROGRAM node test/headless/take-pictures.ts FOLDER
 //
-// About 5 minutes on 2 cores. The pictures show times and measured values, so they differ from run to run.
+// About 6 minutes on 2 cores. The pictures show times and measured values, so they differ from run to run.
 
 import { execFileSync } from 'node:child_process';
 import { mkdtempSync, rmSync, writeFileSync } from 'node:fs';
@@ -23,6 +23,7 @@ if (FATHOM === '' || folder === undefined) {
 }
 const WIDTH = 1040;
 const HEIGHT = 760;
+const PHONE_WIDTH = 390;
 /** Around what is shown, pixels. */
 const MARGIN = 16;
 /** Of a picture, bytes: smaller ones lose sharpness that a reader sees. */
@@ -36,15 +37,17 @@ const serving = await serveWith(PAGES, service.webPort);
 const browser = await launch();
 
 /** Writes a page from the top of an element, or its own, to the end of another; as sharp as the limit allows. */
-async function take(page: Page, name: string, last: Locator, first: Locator | null = null): Promise<void> {
-    await page.setViewportSize({ width: WIDTH, height: HEIGHT });
+async function take(page: Page, name: string, last: Locator, first: Locator | null = null, width = WIDTH): Promise<void> {
+    await page.setViewportSize({ width, height: HEIGHT });
     await page.evaluate(() => (document.activeElement as HTMLElement | null)?.blur());
+    // Nothing is under the pointer.
+    await page.mouse.move(0, 0);
     // Charts and maps take the new size.
     await sleep(1000);
     const topOf = (element: Locator): Promise<number> => element.evaluate((one) => one.getBoundingClientRect().top + scrollY);
     const endOf = (element: Locator): Promise<number> => element.evaluate((one) => one.getBoundingClientRect().bottom + scrollY);
     const y = first === null ? 0 : (await topOf(first)) - MARGIN;
-    const clip = { x: 0, y, width: WIDTH, height: (await endOf(last)) + MARGIN - y };
+    const clip = { x: 0, y, width, height: (await endOf(last)) + MARGIN - y };
     let bytes: Buffer = Buffer.alloc(0);
     for (let quality = 90; quality >= 40 && (bytes.length === 0 || bytes.length > MOST_BYTES); quality -= 5) {
         bytes = await page.screenshot({ type: 'jpeg', quality, fullPage: true, clip });
@@ -74,6 +77,11 @@ try {
     const paused = submit('reef-7', 'Reef slope, joint water', '--set', 'water.partitions=joint', '--partitions', '2x1');
     service.run(ana, 'pause', paused, '--reason', 'after the survey of Friday', '--coordinator', service.url);
 
+    const signIn = await openAs(browser, `${serving.address}/#/jobs`, '', { viewport: { width: WIDTH, height: HEIGHT }, colorScheme: 'light' });
+    await signIn.page.getByLabel('Token').waitFor();
+    await take(signIn.page, 'sign-in', signIn.page.locator('main'));
+    await signIn.page.context().close();
+
     const { page } = await openAs(browser, `${serving.address}/#/jobs`, ana, { viewport: { width: WIDTH, height: HEIGHT }, colorScheme: 'light' });
     const tabs = page.getByRole('navigation', { name: 'Sections of the job' });
     const show = async (route: string): Promise<void> => {
@@ -87,6 +95,30 @@ try {
     await page.getByLabel('Name').fill('Wreck, second survey');
     await page.getByLabel('Dataset').selectOption('wreck-2026');
     await take(page, 'new-job', page.locator('main .card:visible').first());
+
+    await show('datasets');
+    await page.getByRole('row', { name: 'reef-7' }).waitFor();
+    await take(page, 'datasets', page.locator('main .card').last());
+    await show('new');
+    await page.getByLabel('Dataset').waitFor();
+    await page.locator('input[webkitdirectory]').setInputFiles(reef);
+    await page.getByLabel('Upload as').fill('reef-again');
+    await page.getByRole('button', { name: 'Upload and check' }).click();
+    await page.locator('.plan-check-facts').waitFor({ timeout: 180_000 });
+    await page.getByRole('application').waitFor();
+    await take(page, 'folder', page.locator('.plan-check'));
+
+    // What is left of a job that has succeeded.
+    await show(`jobs/${slope}/views`);
+    await page.locator('.fp-compare-stage img').first().waitFor();
+    await take(page, 'views', page.locator('.section .card').last(), tabs);
+    for (const name of ['seams', 'log', 'files'] as const) {
+        await show(`jobs/${slope}/${name}`);
+        await take(page, name, page.locator('.section'), tabs);
+    }
+    await show(`jobs/${slope}/viewer`);
+    await page.waitForFunction(() => document.querySelector<HTMLElement>('.viewer-host')?.fathomViewer !== undefined);
+    await take(page, 'viewer', page.locator('.viewer-host'), tabs);
 
     await show(`jobs/${slope}/water`);
     await page.getByRole('heading', { name: 'Attenuation of direct light' }).waitFor();
@@ -109,6 +141,19 @@ try {
     const operator = await openAs(browser, `${serving.address}/#/service`, service.operator, { viewport: { width: WIDTH, height: HEIGHT }, colorScheme: 'light' });
     await operator.page.getByRole('row', { name: 'gpu-2' }).waitFor();
     await take(operator.page, 'service', operator.page.locator('main .card').last());
+    for (const name of ['queue', 'tenants', 'tokens'] as const) {
+        await operator.page.evaluate((hash) => (location.hash = hash), `#/service/${name}`);
+        await operator.page.locator('main table').waitFor();
+        await take(operator.page, `service-${name}`, operator.page.locator('main .card').last());
+    }
+
+    const small = { viewport: { width: PHONE_WIDTH, height: HEIGHT } };
+    const phone = await openAs(browser, `${serving.address}/#/jobs/${wreckJob}`, ana, { ...small, colorScheme: 'light' });
+    await phone.page.locator('.fp-plan-canvas').waitFor();
+    await take(phone.page, 'job-phone', phone.page.locator('.section .card').nth(1), null, PHONE_WIDTH);
+    const dark = await openAs(browser, `${serving.address}/#/jobs/${wreckJob}`, ana, { colorScheme: 'dark' });
+    await dark.page.locator('.fp-plan-canvas').waitFor();
+    await take(dark.page, 'job-dark', dark.page.locator('.section .card').nth(1));
 } finally {
     await browser.close();
     serving.close();

@@ -12,7 +12,9 @@ import { type TaskHistory, TaskHistorySchema } from '../../src/rpc/fathom/v1/job
 interface Parts {
     readonly fetching?: number;
     readonly training?: number;
+    /** With the part of the disk. */
     readonly photographs?: number;
+    readonly disk?: number;
     readonly watching?: number;
     readonly sending?: number;
 }
@@ -22,6 +24,7 @@ const spent = (seconds: number, parts: Parts) => ({
     fetchingSeconds: parts.fetching ?? 0,
     trainingSeconds: parts.training ?? 0,
     photographsSeconds: parts.photographs ?? 0,
+    diskSeconds: parts.disk ?? 0,
     watchingSeconds: parts.watching ?? 0,
     sendingSeconds: parts.sending ?? 0,
 });
@@ -129,17 +132,44 @@ test('more workers are advised where tasks wait, unless the job limits them', ()
     assert.match(verdictOf(data(40, together, histories))?.advice ?? '', /^Hardly a task waited/);
 });
 
-test('a job whose workers wait for photographs is bound by them', () => {
-    const verdict = verdictOf(
-        data(
-            100,
-            [held('global', 0, 0, 100)],
-            [history('global', 100, { training: 30, photographs: 65, fetching: 5 })],
-        ),
+test('a job whose workers wait for photographs is bound by the disk or by decoding', () => {
+    const of = (parts: Parts) =>
+        verdictOf(data(100, [held('global', 0, 0, 100)], [history('global', 100, parts)]));
+    const decoding = of({ training: 30, photographs: 65, disk: 3, fetching: 5 });
+    assert.equal(decoding?.bound, 'photographs');
+    assert.equal(
+        decoding.text,
+        'Decoding photographs bounds this job: workers spent 62 % of their time waiting for it.',
     );
-    assert.equal(verdict?.bound, 'photographs');
-    assert.match(verdict.text, /^Photographs bound this job: workers spent 65 % of their time waiting/);
-    assert.match(verdict.advice, /train\.prefetch_threads/);
+    assert.match(decoding.advice, /train\.prefetch_threads/);
+    assert.deepEqual(shares(decoding), { training: 30, disk: 3, photographs: 62, network: 5 });
+    const reading = of({ training: 30, photographs: 65, disk: 50, fetching: 5 });
+    assert.equal(reading?.bound, 'disk');
+    assert.equal(
+        reading.text,
+        'Reading photographs from disk bounds this job: workers spent 50 % of their time waiting for the disk, ' +
+            'and 15 % waiting for decoding.',
+    );
+    assert.match(reading.advice, /--cache-dir/);
+    assert.deepEqual(shares(reading), { training: 30, disk: 50, photographs: 15, network: 5 });
+    assert.equal(partText(reading.parts[1]!), 'Reading photographs from disk: 50 %, 50 s');
+    assert.equal(of({ training: 30, photographs: 65 })?.bound, 'photographs', 'a worker that tells no disk');
+});
+
+test('disk and decoding bound a job together, and the larger one is named', () => {
+    const of = (disk: number) =>
+        verdictOf(
+            data(
+                100,
+                [held('global', 0, 0, 100)],
+                [history('global', 100, { training: 38, photographs: 60, disk, watching: 2 })],
+            ),
+        );
+    assert.equal(of(32)?.bound, 'disk');
+    assert.equal(of(28)?.bound, 'photographs');
+    assert.equal(of(30)?.bound, 'photographs');
+    // More than all photographs took: clocks disagree.
+    assert.deepEqual(shares(of(90)), { training: 38, disk: 60, watching: 2 });
 });
 
 test('a job whose workers fetch or send is bound by the network', () => {
@@ -184,7 +214,7 @@ test('where nothing takes much, nothing bounds the job', () => {
         ),
     );
     assert.equal(verdict?.bound, 'nothing');
-    assert.match(verdict.text, /training \(35 %\) and waiting for photographs \(33 %\)/);
+    assert.match(verdict.text, /training \(35 %\) and decoding photographs \(33 %\)/);
 });
 
 test('there is no verdict of a short time, or where workers report no times', () => {

@@ -6,6 +6,9 @@ import {
     difference,
     meanDifference,
     possible,
+    possibleSides,
+    sidesOf,
+    sidesText,
     worstFirst,
 } from '../../src/pages/parts/view-difference.ts';
 
@@ -41,8 +44,24 @@ test('a difference has no sign, is amplified and clamped', () => {
     assert.equal(meanDifference(new Uint8ClampedArray(), new Uint8ClampedArray()), 0);
 });
 
+test('the divider offers pairs that have both pictures', () => {
+    const wet = view('a', 1, { clear: picture });
+    assert.deepEqual(possibleSides(wet), ['photograph-render', 'photograph-clear', 'render-clear']);
+    assert.deepEqual(possibleSides(view('a', 1)), ['photograph-render']);
+    assert.deepEqual(possibleSides({ ...wet, photograph: null }), ['render-clear']);
+    assert.deepEqual(possibleSides({ ...wet, render: null }), ['photograph-clear']);
+    assert.deepEqual(possibleSides({ ...wet, render: null, clear: null }), []);
+    assert.deepEqual(possibleSides(wet).map(sidesText), [
+        'Photograph and render',
+        'Photograph and scene without water',
+        'Render and scene without water',
+    ]);
+    assert.deepEqual(sidesOf('render-clear'), ['render', 'clear']);
+});
+
 test('only what has its pictures can be shown', () => {
     assert.deepEqual([...possible(view('a', 1))].toSorted(), ['compare', 'difference', 'photograph', 'render']);
-    assert.deepEqual([...possible(view('a', 1, { photograph: null, clear: picture }))], ['render', 'clear']);
+    const withoutPhotograph = view('a', 1, { photograph: null, clear: picture });
+    assert.deepEqual([...possible(withoutPhotograph)], ['render', 'compare', 'clear']);
     assert.deepEqual([...possible(view('a', 1, { photograph: null, render: null }))], []);
 });

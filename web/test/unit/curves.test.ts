@@ -8,9 +8,12 @@ import {
     MOST_DRAWN,
     currentPoints,
     firstDrawn,
+    isOfPreviews,
     joined,
     lineOf,
     placeText,
+    previewLine,
+    psnrTitle,
     spanOf,
     startOf,
     valueAt,
@@ -114,6 +117,27 @@ test('a series keeps its colour while others come and go', () => {
     const twelve = Array.from({ length: 12 }, (_, i) => `t${i}`);
     looks.keep(new Set(twelve));
     assert.equal(new Set(twelve.map((task) => JSON.stringify(looks.of(task)))).size, 12, 'twelve that differ');
+});
+
+test('the PSNR of a task that measures nothing is that of its previews', () => {
+    const previews = [
+        { iteration: 2, psnr: 20 },
+        { iteration: 3, psnr: 22 },
+        // After the last point: of an attempt that resumed earlier.
+        { iteration: 9, psnr: 30 },
+    ];
+    const one = { ...series('partition-0000', [point(1), point(2), point(4)]), previews };
+    assert.ok(isOfPreviews(one));
+    assert.deepEqual(previewLine(one, 'iteration', 0), { xs: [2, 3], ys: [20, 22] });
+    assert.deepEqual(previewLine(one, 'time', 1000), { xs: [1, 2], ys: [20, 22] }, 'between the points around them');
+    assert.deepEqual(previewLine({ ...one, points: [] }, 'time', 1000), { xs: [], ys: [] });
+    const measured = { ...one, points: [point(1), point(2, { psnr: 21 })] };
+    assert.ok(!isOfPreviews(measured));
+    assert.ok(!isOfPreviews({ ...one, previews: [] }));
+    assert.equal(psnrTitle([one]), 'PSNR of previews, dB');
+    assert.equal(psnrTitle([measured]), 'PSNR on held-out photographs, dB');
+    assert.equal(psnrTitle([measured, one]), 'PSNR on held-out photographs or of previews, dB');
+    assert.equal(psnrTitle([]), 'PSNR on held-out photographs, dB');
 });
 
 test('places read as words', () => {

@@ -16,6 +16,7 @@ import { JobRecord, mergedPoints } from '../../src/pages/job/record.ts';
 import { flattened, valueText } from '../../src/pages/job/settings.ts';
 import type { CurvePoint } from '../../src/pages/parts/index.ts';
 import { DATASETS_LINK, jobLink, jobsLink, newJobLink, readRoute, serviceLink, shareLink, takeToken } from '../../src/pages/route.ts';
+import { rateText } from '../../src/pages/service/workers.ts';
 import type { Visibility } from '../../src/pages/visibility.ts';
 import { shownState, taskLabel } from '../../src/pages/words.ts';
 import {
@@ -53,12 +54,21 @@ test('an address leads to a page and back', () => {
 test('a token leaves the address, and the rest stays', () => {
     assert.equal(takeToken('#/jobs/7/log'), null);
     assert.equal(takeToken('#/jobs?name=token'), null);
-    assert.deepEqual(takeToken('#/jobs/7/viewer?token=s3cret'), { token: 's3cret', rest: '#/jobs/7/viewer', isBare: false });
-    assert.deepEqual(takeToken('#/jobs?state=failed&token=a%2Bb'), { token: 'a+b', rest: '#/jobs?state=failed', isBare: false });
-    assert.deepEqual(takeToken('#token=abc&job=7'), { token: 'abc', rest: '#/jobs/7', isBare: false });
-    assert.deepEqual(takeToken('#token=abc'), { token: 'abc', rest: '#/jobs', isBare: true });
+    assert.deepEqual(takeToken('#/jobs/7/viewer?token=s3cret'), { token: 's3cret', isInvitation: false, rest: '#/jobs/7/viewer', isBare: false });
+    assert.deepEqual(takeToken('#/jobs?state=failed&token=a%2Bb'), { token: 'a+b', isInvitation: false, rest: '#/jobs?state=failed', isBare: false });
+    assert.deepEqual(takeToken('#token=abc&job=7'), { token: 'abc', isInvitation: false, rest: '#/jobs/7', isBare: false });
+    assert.deepEqual(takeToken('#token=abc'), { token: 'abc', isInvitation: false, rest: '#/jobs', isBare: true });
     const link = shareLink('https://reef.example/', '7', 'a+/=b');
-    assert.deepEqual(takeToken(new URL(link).hash), { token: 'a+/=b', rest: '#/jobs/7', isBare: false });
+    assert.deepEqual(takeToken(new URL(link).hash), { token: 'a+/=b', isInvitation: false, rest: '#/jobs/7', isBare: false });
+});
+
+test('an invitation leaves the address as a token does, and no token stays with it', () => {
+    const isInvitation = true;
+    assert.deepEqual(takeToken('#invitation=fathom_a_b'), { token: 'fathom_a_b', isInvitation, rest: '#/jobs', isBare: true });
+    assert.deepEqual(takeToken('#invitation=i&job=7'), { token: 'i', isInvitation, rest: '#/jobs/7', isBare: false });
+    const both = takeToken('#/jobs/7?invitation=i&token=t&state=failed');
+    assert.deepEqual(both, { token: 'i', isInvitation, rest: '#/jobs/7?state=failed', isBare: false });
+    assert.equal(takeToken('#invitation='), null);
 });
 
 test('numbers and times are short and exact enough', () => {
@@ -75,6 +85,12 @@ test('numbers and times are short and exact enough', () => {
     assert.equal(sentence('there is no job 7'), 'There is no job 7.');
     assert.equal(sentence('name: is too long.'), 'Name: is too long.');
     assert.equal(sentence('model.ply is missing'), 'model.ply is missing.');
+});
+
+test('the rate of a worker is empty where nothing is trained', () => {
+    assert.deepEqual([0, -1, Number.NaN, 0.0519, 12.345, 1234.5].map(rateText), [
+        '', '', '', '0.0519 /s', '12.3 /s', '1,235 /s',
+    ]);
 });
 
 test('states have words', () => {

@@ -1,7 +1,7 @@
 import assert from 'node:assert/strict';
 import { test } from 'node:test';
 
-import type { TaskInfo } from '../../src/pages/parts/part.ts';
+import { type TaskInfo, shownPsnr } from '../../src/pages/parts/part.ts';
 import {
     type PlanContent,
     type PlanPartition,
@@ -152,6 +152,14 @@ test('with an exchange the first part counts until the rest begins', () => {
     assert.deepEqual(of('done', 'running'), ['running', false]);
     assert.deepEqual(of('failed', 'cancelled'), ['failed', true]);
     assert.deepEqual(of('done', 'done'), ['done', false]);
+});
+
+test('a measured PSNR counts before that of previews', () => {
+    assert.deepEqual(shownPsnr({ psnr: 24, previewPsnr: 20 }), { value: 24, isOfPreviews: false });
+    assert.deepEqual(shownPsnr({ psnr: null, previewPsnr: 20 }), { value: 20, isOfPreviews: true });
+    assert.equal(shownPsnr({ psnr: null }), null);
+    assert.equal(shownPsnr({ psnr: Number.NaN, previewPsnr: null }), null);
+    assert.equal(shownPsnr(null), null);
 });
 
 test('x is to the right and z up, and pixels lead back to the plane', () => {

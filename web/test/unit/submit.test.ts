@@ -7,7 +7,16 @@ import { create } from '@bufbuild/protobuf';
 import { Code, ConnectError } from '@connectrpc/connect';
 
 import { faultOf, wrongFieldsOf } from '../../src/pages/faults.ts';
-import { digestsOf, firstSeries, frameAt, newestFrame, seriesOf } from '../../src/pages/job/preview-series.ts';
+import {
+    digestsOf,
+    firstSeries,
+    frameAt,
+    latestPsnr,
+    newestFrame,
+    roundsOf,
+    seriesOf,
+    withPreviews,
+} from '../../src/pages/job/preview-series.ts';
 import { type JobForm, WrongForm, configOf, freshUuid, wrongField } from '../../src/pages/job-settings.ts';
 import { picturesIn } from '../../src/pages/thumbnails.ts';
 import { type TaskHistory, TaskHistorySchema } from '../../src/rpc/fathom/v1/job_pb.ts';
@@ -126,6 +135,30 @@ test('previews are grouped by task and view, and by iteration', () => {
     assert.equal(firstSeries(series, new Set())?.key, series[1]!.key, 'the first view of the last task');
     assert.equal(firstSeries(series, new Set(['global']))?.key, series[0]!.key, 'a task that runs');
     assert.equal(firstSeries([], new Set()), null);
+});
+
+test('the PSNR of a round of previews is the mean over its views', () => {
+    const previews = [
+        { view: 'a', iteration: 20, psnrDb: 24 },
+        { view: 'b', iteration: 20, psnrDb: 26 },
+        { view: 'a', iteration: 10, psnrDb: 20 },
+        { view: 'b', iteration: 10 },
+        { view: 'a', iteration: 30, psnrDb: Number.NaN },
+        // Trained again after a loss.
+        { view: 'b', iteration: 20, psnrDb: 28 },
+    ].map((one) => Object.assign(one, { render: blob('x') }));
+    const task = create(TaskHistorySchema, { taskId: 'global', previews });
+    assert.deepEqual(roundsOf(task), [
+        { iteration: 10, psnr: 20 },
+        { iteration: 20, psnr: 26 },
+    ]);
+    const [a, b] = seriesOf([task]);
+    assert.deepEqual(a!.frames.map(({ psnr }) => psnr), [20, 24, null]);
+    assert.deepEqual([latestPsnr(a!), latestPsnr(b!)], [24, 28]);
+    const info = { task: 'global', stage: 'global', partition: null, state: 'running', worker: null };
+    const counts = { iteration: 0, iterations: 0, attempts: 1, psnr: null };
+    const tasks = withPreviews([{ ...info, ...counts }, { ...info, ...counts, task: 'other' }], [task]);
+    assert.deepEqual(tasks.map(({ previewPsnr }) => previewPsnr), [26, null]);
 });
 
 test('a preview without a picture is left out', () => {

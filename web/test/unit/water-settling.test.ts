@@ -7,7 +7,15 @@ import { create } from '@bufbuild/protobuf';
 import { timestampFromMs } from '@bufbuild/protobuf/wkt';
 
 import { isInAir, waterSeriesOf } from '../../src/pages/job/water-history.ts';
-import { type WaterSeries, firstShown, spreadOfPartitions } from '../../src/pages/parts/water-points.ts';
+import {
+    type WaterSeries,
+    bandOf,
+    firstShown,
+    spreadOfPartitions,
+    waterAt,
+} from '../../src/pages/parts/water-points.ts';
+import { patch } from '../../src/pages/parts/water-values.ts';
+import { checkWater } from '../../src/viewer/water.ts';
 import { Stage, TaskHistorySchema, TaskSchema } from '../../src/rpc/fathom/v1/job_pb.ts';
 
 const series = (task: string, stage: string, ...scales: readonly number[]): WaterSeries => ({
@@ -79,6 +87,35 @@ test('the spread is that of the latest values, and of partitions that differ', (
     assert.deepEqual(spread?.of.b_inf[0], { lowest: 0, highest: 0, share: null });
     assert.equal(spreadOfPartitions(after), null, 'all have one water');
     assert.equal(spreadOfPartitions(parts.slice(1)), null, 'one partition');
+});
+
+test('a band holds the lowest, the highest and the mean of the tasks that have come so far', () => {
+    const red = ({ beta_d }: WaterSeries['points'][number]): number => beta_d[0];
+    // Points at iterations 0, 100, 200, and of the second task at 0 and 100.
+    const [a, b] = [series('a', 'partition', 1, 2, 3), series('b', 'partition', 3, 1)];
+    const band = bandOf([a, b], red)!;
+    assert.deepEqual(band.lowest, { xs: [0, 100], ys: [4, 4] });
+    assert.deepEqual(band.highest, { xs: [0, 100], ys: [12, 8] });
+    assert.deepEqual(band.mean, { xs: [0, 100], ys: [8, 6] });
+    const later = { ...b, points: [{ ...b.points[0]!, iteration: 50 }, { ...b.points[1]!, iteration: 150 }] };
+    const between = bandOf([a, later], red)!;
+    assert.deepEqual(between.mean.xs, [50, 100, 150]);
+    assert.deepEqual(between.mean.ys, [(6 + 12) / 2, (8 + 8) / 2, (10 + 4) / 2], 'between points along a line');
+    assert.equal(bandOf([a], red), null);
+    assert.equal(bandOf([], red), null);
+    const many = Array.from({ length: 3 }, (_, i) => ({
+        ...a,
+        points: Array.from({ length: 500 }, (__, at) => ({ ...a.points[0]!, iteration: 3 * at + i })),
+    }));
+    const long = bandOf(many, red)!;
+    assert.ok(long.mean.xs.length <= 200);
+    assert.deepEqual([...new Set(long.mean.ys)], [4]);
+});
+
+test('the colours of a moment are those that its water makes', () => {
+    const water = waterAt(series('a', 'partition', 0.1).points[0]!);
+    assert.deepEqual(checkWater(water), water);
+    assert.ok(patch(water, [0.5, 0.5, 0.5], 10)[0] < patch(water, [0.5, 0.5, 0.5], 1)[0], 'red goes first');
 });
 
 test('settings without a medium are known', () => {

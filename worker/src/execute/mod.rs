@@ -31,7 +31,7 @@ use futures::future::BoxFuture;
 pub use self::previews::Picture;
 use crate::WorkerError;
 pub use crate::heartbeat::Stop;
-use crate::views::{PhotographFile, PhotographSource};
+use crate::views::{PhotographFile, PhotographSource, ReadingTime};
 
 /// Layout version of [`TaskSpec`] that this program reads.
 pub const SPEC_FORMAT: u32 = 2;
@@ -65,6 +65,8 @@ pub struct TaskInput {
     pub checkpoint_iteration: u32,
     /// Photographs, masks and points of this task, by digest.
     pub files: HashMap<String, PathBuf>,
+    /// How long the photographs of its training took so far.
+    pub reading: Arc<ReadingTime>,
 }
 
 impl TaskInput {
@@ -142,7 +144,8 @@ impl TaskInput {
                 "{ranges} clear ranges for {views} views; one per view is needed, finite and at least 0"
             )));
         }
-        let views = self.views_of(views, clear_ranges, *max_resolution_px, limit_bytes)?;
+        let reading = Arc::clone(&self.reading);
+        let views = self.views_timed(views, clear_ranges, *max_resolution_px, limit_bytes, reading)?;
         Ok(match &self.work {
             Work::Global(GlobalSpec { view_weights }) if !view_weights.is_empty() => {
                 Arc::new(Weighted::new(views, view_weights.clone())?)
@@ -174,6 +177,19 @@ impl TaskInput {
         max_resolution: u32,
         limit_bytes: u64,
     ) -> Result<Arc<dyn ViewSource>, TaskError> {
+        // Only the wait of the training is divided.
+        self.views_timed(indices, clear_ranges, max_resolution, limit_bytes, Arc::default())
+    }
+
+    /// As [`Self::views_of`]; what reading them takes is added to `reading`.
+    fn views_timed(
+        &self,
+        indices: &[u32],
+        clear_ranges: &[f32],
+        max_resolution: u32,
+        limit_bytes: u64,
+        reading: Arc<ReadingTime>,
+    ) -> Result<Arc<dyn ViewSource>, TaskError> {
         let mut files = Vec::with_capacity(indices.len());
         for (place, &index) in indices.iter().enumerate() {
             let view = self.manifest.views.get(index as usize);
@@ -192,7 +208,7 @@ impl TaskInput {
             });
         }
         let mask_keep = self.config.data.mask_keep;
-        Ok(Arc::new(PhotographSource::new(files, mask_keep, max_resolution, limit_bytes)?))
+        Ok(Arc::new(PhotographSource::new(files, mask_keep, max_resolution, limit_bytes, reading)?))
     }
 }
 

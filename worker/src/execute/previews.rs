@@ -1,13 +1,17 @@
 //! Previews: small pictures of held-out views while a run trains, for those who watch the job.
 
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use fathom_core::Result;
 use fathom_core::config::TrainConfig;
 use fathom_core::method::Run;
+use fathom_core::metrics::psnr;
 use fathom_core::picture::{encode_jpeg, prepared_camera};
 use fathom_core::scene::{PinholeCamera, Pose};
+use fathom_core::train::Preview;
+use fathom_core::views::{PackedImage, ViewSource};
 
 use super::TaskInput;
 
@@ -29,11 +33,33 @@ pub struct Picture {
     pub render: Bytes,
     /// The same without the water, a JPEG; `None` where there is none.
     pub clear: Option<Bytes>,
+    /// PSNR of the render against the photograph, dB; `None` without a photograph, or if they are equal.
+    pub psnr_db: Option<f64>,
+}
+
+/// A view in previews.
+struct PreviewedView {
+    name: String,
+    source: Option<Arc<dyn ViewSource>>,
+    /// Read at the first preview, and kept: it is small.
+    photograph: Option<Arc<PackedImage>>,
+}
+
+impl PreviewedView {
+    fn psnr_db(&mut self, preview: &Preview) -> Option<f64> {
+        if let Some(source) = self.source.take() {
+            let read = source.load(0);
+            self.photograph = read.inspect_err(|error| tracing::debug!(%error, "a preview has no PSNR")).ok();
+        }
+        let render = PackedImage::from_rgb8(preview.width, preview.height, &preview.render);
+        Some(psnr(&render, self.photograph.as_ref()?)).filter(|psnr| psnr.is_finite())
+    }
 }
 
 /// The previews of an attempt.
 pub struct Previews {
-    names: Vec<String>,
+    views: Vec<PreviewedView>,
+    /// The camera of each.
     cameras: Vec<(PinholeCamera, Pose)>,
     every: Duration,
     begun: Instant,
@@ -46,13 +72,16 @@ impl Previews {
         let seen = |&index: &u32| {
             let view = task.manifest.views.get(index as usize)?;
             let camera = prepared_camera(task.manifest.camera(view.camera_id)?, MOST_PIXELS).ok()?;
-            Some((view.name.clone(), (camera, view.pose)))
+            // Without its photograph a view has previews all the same.
+            let source = task.views_of(&[index], &[], MOST_PIXELS, 0).ok();
+            let seen = PreviewedView { name: view.name.clone(), source, photograph: None };
+            Some((seen, (camera, view.pose)))
         };
         let wanted = config.preview_seconds > 0;
-        let (names, cameras) = task.common.previews.iter().filter(|_| wanted).filter_map(seen).unzip();
+        let (views, cameras) = task.common.previews.iter().filter(|_| wanted).filter_map(seen).unzip();
         let every = Duration::from_secs(config.preview_seconds.into());
         let begun = Instant::now();
-        Self { names, cameras, every, begun, due: begun + every.min(FIRST_AFTER) }
+        Self { views, cameras, every, begun, due: begun + every.min(FIRST_AFTER) }
     }
 
     /// Makes the next ones due.
@@ -69,12 +98,13 @@ impl Previews {
             return None;
         }
         let made = run.preview(&self.cameras, go_on).and_then(|previews| {
-            let picture = |(view, preview): (&String, fathom_core::train::Preview)| -> Result<Picture> {
+            let picture = |(view, preview): (&mut PreviewedView, Preview)| -> Result<Picture> {
                 let jpeg = |rgb: &[u8]| encode_jpeg(preview.width, preview.height, rgb).map(Bytes::from);
                 let clear = preview.clear.as_deref().map(jpeg).transpose()?;
-                Ok(Picture { view: view.clone(), render: jpeg(&preview.render)?, clear })
+                let psnr_db = view.psnr_db(&preview);
+                Ok(Picture { view: view.name.clone(), render: jpeg(&preview.render)?, clear, psnr_db })
             };
-            self.names.iter().zip(previews).map(picture).collect::<Result<Vec<_>>>()
+            self.views.iter_mut().zip(previews).map(picture).collect::<Result<Vec<_>>>()
         });
         let end = Instant::now();
         self.due = end + pause(self.every, end - self.begun, end - begin);

@@ -81,6 +81,7 @@ fn task(dir: &Path, cap: u32) -> TaskInput {
         checkpoint: None,
         checkpoint_iteration: 0,
         files,
+        reading: Arc::default(),
     }
 }
 

@@ -22,6 +22,7 @@ use fathom_proto::worker::v1::CommonSpec;
 
 use super::previews::Previews;
 use super::{Control, Stop, TaskError, TaskInput, TaskOutput};
+use crate::views::DiskWait;
 
 /// Device time between two checks of the control.
 const LOOK_EVERY: Duration = Duration::from_millis(500);
@@ -215,6 +216,7 @@ pub fn advance(
     let mut stretch = FIRST_STRETCH;
     let (mut training, mut watching) = (Duration::ZERO, Duration::ZERO);
     let waited_before = run.waited_for_photographs();
+    let mut disk_wait = DiskWait::new(Arc::clone(&task.reading));
     while run.progress().iteration < span.until {
         match control.stop_reason() {
             None => {}
@@ -245,6 +247,7 @@ pub fn advance(
             time_spent: Some(v1::TimeSpent {
                 training_seconds: training.saturating_sub(photographs).as_secs_f32(),
                 photographs_seconds: photographs.as_secs_f32(),
+                disk_seconds: Some(disk_wait.after(photographs).as_secs_f32()),
                 watching_seconds: watching.as_secs_f32(),
                 ..v1::TimeSpent::default()
             }),

@@ -11,13 +11,14 @@ import { type TimelineEvent, attemptsOf } from '../parts/timeline-bars.ts';
 
 /** Where time goes. */
 export type Part =
-    'training' | 'photographs' | 'network' | 'watching' | 'coordinator' | 'waiting' | 'unknown';
+    'training' | 'disk' | 'photographs' | 'network' | 'watching' | 'coordinator' | 'waiting' | 'unknown';
 /** What is named: a part, or nothing where no part is large enough. */
 export type Bound = Exclude<Part, 'unknown'> | 'nothing';
 
 export const PART_WORDS: Readonly<Record<Part, string>> = {
     training: 'Training',
-    photographs: 'Waiting for photographs',
+    disk: 'Reading photographs from disk',
+    photographs: 'Decoding photographs',
     network: 'Fetching input, sending results',
     watching: 'Measuring, previews, checkpoints',
     coordinator: 'Work of the coordinator',
@@ -51,6 +52,8 @@ export interface Verdict {
 const LEAST_SECONDS = 20;
 /** The share from which on something bounds a job. */
 const BOUND_FROM = 0.4;
+/** The share from which on a part is named beside the one that bounds a job. */
+const WORTH_NAMING = 0.05;
 /** Where more is not known, nothing is said. */
 const MOST_UNKNOWN = 0.5;
 /** Tasks that wait for a worker, on average, from which on more workers would help. */
@@ -69,21 +72,36 @@ const FINAL: ReadonlySet<string> = new Set(['succeeded', 'failed', 'cancelled'])
 interface Spent {
     all: number;
     training: number;
+    /** Training waited for photographs: for the disk, and for the rest of the work on them. */
+    disk: number;
     photographs: number;
     fetching: number;
     sending: number;
     watching: number;
 }
 
-const spentOf = (time: TimeSpent): Spent => ({
-    all: time.seconds,
-    training: time.trainingSeconds,
-    photographs: time.photographsSeconds,
-    fetching: time.fetchingSeconds,
-    sending: time.sendingSeconds,
-    watching: time.watchingSeconds,
-});
-const NOTHING: Spent = { all: 0, training: 0, photographs: 0, fetching: 0, sending: 0, watching: 0 };
+function spentOf(time: TimeSpent): Spent {
+    // The disk is a part of what photographs took. Workers before this split report none.
+    const disk = Math.min(Math.max(0, time.diskSeconds ?? 0), time.photographsSeconds);
+    return {
+        all: time.seconds,
+        training: time.trainingSeconds,
+        disk,
+        photographs: time.photographsSeconds - disk,
+        fetching: time.fetchingSeconds,
+        sending: time.sendingSeconds,
+        watching: time.watchingSeconds,
+    };
+}
+const NOTHING: Spent = {
+    all: 0,
+    training: 0,
+    disk: 0,
+    photographs: 0,
+    fetching: 0,
+    sending: 0,
+    watching: 0,
+};
 
 function sum(all: readonly Spent[]): Spent {
     const total = { ...NOTHING };
@@ -226,6 +244,10 @@ function words(
 ): { readonly text: string; readonly advice: string } {
     const ofWorkers = (part: number): string =>
         `workers spent ${percentOf(part / Math.max(spent.all, 1e-9))} of their time`;
+    const andAlso = (part: number, what: string): string => {
+        const share = part / Math.max(spent.all, 1e-9);
+        return share < WORTH_NAMING ? '' : `, and ${percentOf(share)} waiting for ${what}`;
+    };
     switch (bound) {
         case 'training': {
             const text = `The GPU bounds this job: ${ofWorkers(spent.training)} training.`;
@@ -242,12 +264,23 @@ function words(
                 : 'More partitions (--partitions) let several workers share the work.';
             return { text, advice };
         }
+        case 'disk':
+            return {
+                text:
+                    `Reading photographs from disk bounds this job: ${ofWorkers(spent.disk)} waiting for the ` +
+                    `disk${andAlso(spent.photographs, 'decoding')}.`,
+                advice:
+                    'What helps: --cache-dir on a faster disk of the worker, and more memory for decoded ' +
+                    'photographs (--image-cache-bytes), so that each is read once.',
+            };
         case 'photographs':
             return {
-                text: `Photographs bound this job: ${ofWorkers(spent.photographs)} waiting for them.`,
+                text:
+                    `Decoding photographs bounds this job: ${ofWorkers(spent.photographs)} waiting for ` +
+                    `it${andAlso(spent.disk, 'the disk')}.`,
                 advice:
-                    'What helps: more threads that read ahead (train.prefetch_threads), more memory for ' +
-                    'decoded photographs (--image-cache-bytes), and --cache-dir on a faster disk.',
+                    'What helps: more threads that read ahead (train.prefetch_threads), on a machine with ' +
+                    'processors for them, and more memory for decoded photographs (--image-cache-bytes).',
             };
         case 'network': {
             const done = 'fetching input and sending results';
@@ -300,6 +333,7 @@ export function verdictOf(data: BoundsData): Verdict | null {
     const time = filled(data);
     const seconds: Record<Part, number> = {
         training: 0,
+        disk: 0,
         photographs: 0,
         network: 0,
         watching: 0,
@@ -309,12 +343,13 @@ export function verdictOf(data: BoundsData): Verdict | null {
     };
     const reported = new Map(data.histories.map(({ taskId, points }) => [taskId, spentBy(points)]));
     for (const [task, weight] of time.held) {
-        const { all, training, photographs, fetching, sending, watching } = reported.get(task) ?? NOTHING;
+        const { all, training, disk, photographs, fetching, sending, watching } = reported.get(task) ?? NOTHING;
         const network = fetching + sending;
         // Where clocks disagree, the parts may be more than the whole.
-        const whole = Math.max(all, training + photographs + network + watching);
+        const whole = Math.max(all, training + disk + photographs + network + watching);
         const parts: readonly (readonly [Part, number])[] = [
             ['training', training],
+            ['disk', disk],
             ['photographs', photographs],
             ['network', network],
             ['watching', watching],
@@ -332,8 +367,15 @@ export function verdictOf(data: BoundsData): Verdict | null {
         return null;
     }
     const known = PARTS.filter((part) => part !== 'unknown') as Exclude<Part, 'unknown'>[];
-    const largest = known.reduce((a, b) => (seconds[b] > seconds[a] ? b : a));
-    const bound: Bound = seconds[largest] >= BOUND_FROM * total ? largest : 'nothing';
+    // Disk and decoding are both the way of a photograph to the GPU. Together they may bound a job; then the
+    // larger one is named.
+    const forPhotographs = seconds.disk + seconds.photographs;
+    const weightOf = (part: Part): number =>
+        part === 'disk' || part === 'photographs' ? forPhotographs : seconds[part];
+    const heaviest = known.reduce((a, b) => (weightOf(b) > weightOf(a) ? b : a));
+    const largest =
+        heaviest !== 'disk' || seconds.disk > seconds.photographs ? heaviest : ('photographs' as const);
+    const bound: Bound = weightOf(largest) >= BOUND_FROM * total ? largest : 'nothing';
     const spent = sum([...reported.values()]);
     return {
         bound,

@@ -7,6 +7,7 @@ import type { CurvePoint, CurveSeries } from '../parts/curve-points.ts';
 import { curves } from '../parts/curves.ts';
 import { taskLabel } from '../words.ts';
 import { followHistory } from './history.ts';
+import { type PreviewRound, roundsOf } from './preview-series.ts';
 import { mergedPoints, pointOf } from './record.ts';
 import type { JobContext, Section } from './section.ts';
 
@@ -19,6 +20,7 @@ export function open(container: HTMLElement, context: JobContext): Section {
     container.append(note, host);
     const view = curves(host);
     let kept = new Map<string, readonly CurvePoint[]>();
+    let previews = new Map<string, readonly PreviewRound[]>();
     let timer = 0;
 
     function draw(): void {
@@ -30,7 +32,7 @@ export function open(container: HTMLElement, context: JobContext): Section {
         for (const { taskId } of context.job.tasks) {
             const points = mergedPoints(kept.get(taskId) ?? [], record.points.get(taskId) ?? []);
             if (points.length > 0) {
-                series.push({ task: taskId, label: taskLabel(taskId), points });
+                series.push({ task: taskId, label: taskLabel(taskId), points, previews: previews.get(taskId) ?? [] });
             }
         }
         view.update({ series });
@@ -47,6 +49,7 @@ export function open(container: HTMLElement, context: JobContext): Section {
                     ),
                 ]),
             );
+            previews = new Map(tasks.map((task) => [task.taskId, roundsOf(task)]));
             note.hidden = true;
             draw();
         },

@@ -10,6 +10,7 @@ import { type JobContext, type Section, whenSucceeded } from './section.ts';
 /** What each file is for. */
 const MEANINGS: Readonly<Record<string, string>> = {
     'model.ply': 'The model, for viewers of 3D Gaussians',
+    'model.compressed.ply': 'A smaller copy of the model, for viewing',
     'model.json': 'The parts of the model',
     'water.json': 'The water parameters with standard errors',
     'metrics.json': 'Quality on held-out photographs',

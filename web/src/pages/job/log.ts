@@ -30,7 +30,7 @@ const LEVELS: readonly (readonly [LogSeverity, string])[] = [
     [LogSeverity.ERROR, 'Errors'],
 ];
 
-interface Line {
+export interface Line {
     readonly timeMs: number;
     readonly level: LogSeverity;
     readonly task: string;
@@ -56,10 +56,29 @@ export interface LineFilter {
     readonly text: string;
 }
 
+/** Whether a filter shows a line. */
 export const admits = (filter: LineFilter, line: Line): boolean =>
     line.level >= filter.level &&
     (filter.task === '' || line.task === filter.task) &&
     (filter.text === '' || line.message.toLowerCase().includes(filter.text));
+
+/** The indices of the lines that a filter shows, in their order. */
+export const admitted = (filter: LineFilter, lines: readonly Line[]): number[] => {
+    const indices: number[] = [];
+    lines.forEach((line, index) => {
+        if (admits(filter, line)) {
+            indices.push(index);
+        }
+    });
+    return indices;
+};
+
+/** The filter of what is entered in the fields. */
+export const filterOf = (task: string, level: string, text: string): LineFilter => ({
+    task,
+    level: Number(level),
+    text: text.trim().toLowerCase(),
+});
 
 const asText = (line: Line): string =>
     `${new Date(line.timeMs).toISOString()} ${severityWord(line.level).toUpperCase()} ${line.task}#${line.attempt} ${line.worker} ${line.message}`;
@@ -167,13 +186,8 @@ export function open(container: HTMLElement, context: JobContext): Section {
     }
 
     function filterAgain(): void {
-        filter = { task: task.value, level: Number(level.value), text: text.value.trim().toLowerCase() };
-        shown = [];
-        lines.forEach((line, index) => {
-            if (admits(filter, line)) {
-                shown.push(index);
-            }
-        });
+        filter = filterOf(task.value, level.value, text.value);
+        shown = admitted(filter, lines);
         drawn.forEach((element) => element.remove());
         drawn.clear();
         select(null);

@@ -14,6 +14,7 @@ import { boundsBar } from './bounds-bar.ts';
 import { verdictOf } from './bounds.ts';
 import { followHistory } from './history.ts';
 import { Photographs } from './photographs.ts';
+import { withPreviews } from './preview-series.ts';
 import type { JobContext, Section } from './section.ts';
 
 /**
@@ -94,6 +95,7 @@ export function open(container: HTMLElement, context: JobContext): Section {
     let plan: PlanContent | null = null;
     let manifest: ManifestContent | null = null;
     let isAsked = false;
+    let histories: readonly TaskHistory[] | null = null;
 
     const ask = async (digest: string): Promise<void> => {
         isAsked = true;
@@ -122,13 +124,12 @@ export function open(container: HTMLElement, context: JobContext): Section {
             void ask(job.plan.digest);
         }
         const { tasks } = record;
-        map.update({ plan, cameras: manifest, tasks });
+        map.update({ plan, cameras: manifest, tasks: withPreviews(tasks, histories ?? []) });
         line.update({ tasks, events: record.events, nowMs: record.nowMs });
         if (details.open) {
             table.show(job.tasks);
         }
     }
-    let histories: readonly TaskHistory[] | null = null;
     let countTimer = 0;
     function count(): void {
         countTimer = 0;
@@ -145,6 +146,7 @@ export function open(container: HTMLElement, context: JobContext): Section {
         (history) => {
             histories = history.tasks;
             count();
+            update();
         },
         // What was shown stays.
         () => {},

@@ -1,6 +1,7 @@
 // The previews of a job by task and view, without anything of the page.
 
 import type { TaskHistory } from '../../rpc/fathom/v1/job_pb.ts';
+import type { TaskInfo } from '../parts/part.ts';
 
 /** The pictures of a view after some iterations, by the digests of their blobs. */
 export interface Frame {
@@ -8,6 +9,15 @@ export interface Frame {
     readonly render: string;
     /** Without the water; null where there is none. */
     readonly clear: string | null;
+    /** Of the render against its photograph, dB; null where it is not known. */
+    readonly psnr: number | null;
+}
+
+/** The previews of a task after so many iterations. */
+export interface PreviewRound {
+    readonly iteration: number;
+    /** The mean over its views, dB. */
+    readonly psnr: number;
 }
 
 /** How a held-out view improves in the training of one task. */
@@ -21,14 +31,46 @@ export interface PreviewSeries {
     readonly iterations: number;
 }
 
+const measured = (psnr: number | undefined): number | null =>
+    psnr !== undefined && Number.isFinite(psnr) ? psnr : null;
+
+/** The rounds of previews of a task whose PSNR is known, by ascending iteration. */
+export function roundsOf({ previews }: TaskHistory): readonly PreviewRound[] {
+    const rounds = new Map<number, Map<string, number>>();
+    for (const { view, iteration, psnrDb } of previews) {
+        const psnr = measured(psnrDb);
+        if (psnr !== null) {
+            // Of an iteration that was trained again the later preview holds.
+            rounds.set(iteration, (rounds.get(iteration) ?? new Map<string, number>()).set(view, psnr));
+        }
+    }
+    return [...rounds]
+        .toSorted(([a], [b]) => a - b)
+        .map(([iteration, views]) => {
+            const psnr = [...views.values()].reduce((sum, value) => sum + value, 0) / views.size;
+            return { iteration, psnr };
+        });
+}
+
+/** Tasks with the PSNR of their latest previews. */
+export function withPreviews(tasks: readonly TaskInfo[], histories: readonly TaskHistory[]): readonly TaskInfo[] {
+    const latest = new Map(histories.map((history) => [history.taskId, roundsOf(history).at(-1)?.psnr ?? null]));
+    return tasks.map((task) => ({ ...task, previewPsnr: latest.get(task.task) ?? null }));
+}
+
+/** The latest PSNR of a series. */
+export const latestPsnr = ({ frames }: PreviewSeries): number | null =>
+    frames.findLast(({ psnr }) => psnr !== null)?.psnr ?? null;
+
 /** The series of all tasks, in the order of the tasks and then of the names of the views. */
 export function seriesOf(tasks: readonly TaskHistory[]): readonly PreviewSeries[] {
     return tasks.flatMap(({ taskId, points, previews }) => {
         const frames = new Map<string, Frame[]>();
-        for (const { view, iteration, render, clear } of previews) {
+        for (const { view, iteration, render, clear, psnrDb } of previews) {
             if (render !== undefined) {
                 const known = frames.get(view) ?? [];
-                known.push({ iteration, render: render.digest, clear: clear?.digest ?? null });
+                const psnr = measured(psnrDb);
+                known.push({ iteration, render: render.digest, clear: clear?.digest ?? null, psnr });
                 frames.set(view, known);
             }
         }

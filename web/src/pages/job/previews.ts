@@ -7,16 +7,19 @@ import { freshId, h, setAttribute, setText } from '../dom.ts';
 import { faultOf } from '../faults.ts';
 import { countText } from '../format.ts';
 import { compareViews } from '../parts/compare-views.ts';
+import { decibels } from '../parts/format.ts';
 import { type GetPicture, NoPicture } from '../parts/part.ts';
 import type { ComparedView } from '../parts/view-difference.ts';
 import { hasEnded, taskLabel } from '../words.ts';
 import { Addresses } from './addresses.ts';
 import { followHistory } from './history.ts';
 import { Photographs } from './photographs.ts';
-import { type Frame, type PreviewSeries, digestsOf, firstSeries, frameAt, seriesOf } from './preview-series.ts';
+import { type Frame, type PreviewSeries, digestsOf, firstSeries, frameAt, latestPsnr, seriesOf } from './preview-series.ts';
 import type { JobContext, Section } from './section.ts';
 
 /** Previews have at most this many pixels along a side. Photographs are made as small, to be compared. */
+/** A picture of a preview that is larger was not made by a worker of ours. */
+const MOST_PICTURE_BYTES = 512 * 1024;
 const MOST_PIXELS = 480;
 /** A picture whose name has just arrived may not be readable yet, so it is asked for so many times. */
 const ATTEMPTS = 3;
@@ -92,7 +95,7 @@ class Blobs {
         let address: Promise<string> | null = null;
         const read = async (): Promise<string> => {
             try {
-                const made = this.#addresses.of(await session.api.blob(digest, id, signal, 'image/jpeg'));
+                const made = this.#addresses.of(await session.api.blob(digest, id, signal, 'image/jpeg', MOST_PICTURE_BYTES));
                 this.#read.set(digest, made);
                 return made;
             } catch (error) {
@@ -213,14 +216,15 @@ export function openPreviews(container: HTMLElement, context: JobContext): Secti
     /** A series as it is now, or at the iteration that the reader chose. */
     const viewOf = (series: PreviewSeries, isShown: boolean): ComparedView => {
         const newest = frameAt(series, null);
-        const { render, clear } = isShown ? frameAt(series, iteration) : newest;
-        const label = taskLabel(series.task);
+        const { render, clear, psnr } = isShown ? frameAt(series, iteration) : newest;
+        const task = taskLabel(series.task);
+        const latest = latestPsnr(series);
         return {
             key: series.key,
             name: series.view,
-            label,
-            facts: label,
-            psnr: null,
+            label: latest === null ? task : `${decibels(latest)}, ${task}`,
+            facts: psnr === null ? task : `${task}, PSNR ${decibels(psnr)}`,
+            psnr: latest,
             ssim: null,
             photograph: photograph(series.view),
             render: blobs.of(render),
@@ -244,7 +248,10 @@ export function openPreviews(container: HTMLElement, context: JobContext): Secti
             container.replaceChildren(host);
         }
         slider.show(shown, frameAt(shown, iteration));
-        part.update({ views: series.map((one) => viewOf(one, one === shown)), order: 'given', chosen: shown.key });
+        const views = series.map((one) => viewOf(one, one === shown));
+        // Without any PSNR the order of the tasks says more than that of the names.
+        const order = views.some(({ psnr }) => psnr !== null) ? 'worst' : 'given';
+        part.update({ views, order, chosen: shown.key });
     }
 
     function showEmpty(): void {

@@ -14,6 +14,10 @@ import { Photographs } from './photographs.ts';
 import type { JobContext, Section } from './section.ts';
 
 const MODEL = 'model.ply';
+/** What the coordinator makes of it for viewing, with about a quarter of the bytes. */
+const COPY = 'model.compressed.ply';
+/** Of smaller models the copy is not worth its errors. */
+const COPY_FROM_BYTES = 32e6;
 /** Before the names of models that are made here: each has a name of its own. */
 const LIVE = 'live:';
 /** Before the names of photographs, which are blobs and no files of the job. */
@@ -30,16 +34,32 @@ export function open(container: HTMLElement, context: JobContext): Section {
     const shownText = h('span');
     const newText = h('span');
     const refresh = h('button', { type: 'button', onclick: () => void renew() }, 'Show it');
+    const whole = h(
+        'button',
+        {
+            type: 'button',
+            hidden: true,
+            onclick: () => {
+                wantsWhole = true;
+                void renew();
+            },
+        },
+        'Load the whole model',
+    );
     const line = h(
         'div',
         { class: 'row between live' },
         h('p', { role: 'status' }, shownText),
-        h('div', { class: 'row' }, h('p', { role: 'status' }, newText), refresh),
+        h('div', { class: 'row' }, h('p', { role: 'status' }, newText), refresh, whole),
     );
     let handle: ViewerHandle | null = null;
     let models: Promise<LiveModel> | null = null;
     /** What the viewer shows, or is about to show. */
     let shown: Live | null = null;
+    /** Whether the copy of the model does not do. */
+    let wantsWhole = false;
+    /** What is said about the copy that is shown; empty where it is the model itself. */
+    let copyText = '';
     /** What is told in place of the viewer. */
     let told = '';
     let isBusy = false;
@@ -73,10 +93,21 @@ export function open(container: HTMLElement, context: JobContext): Section {
         return cameras.length === 0 ? null : cameras;
     };
 
-    /** The path of a model for the viewer; one that is not finished is made. */
-    async function pathOf(live: Live, onStep: (text: string) => void): Promise<string> {
+    /** The file of the finished model that is loaded, and how many bytes the model and this file have. */
+    async function fileOf(): Promise<{ path: string; bytes: number; modelBytes: number }> {
+        const files = await context.files();
+        const bytesOf = (name: string): number => Number(files.find(({ path }) => path === name)?.blob?.sizeBytes ?? 0);
+        const [modelBytes, copyBytes] = [bytesOf(MODEL), bytesOf(COPY)];
+        const isCopy = !wantsWhole && modelBytes >= COPY_FROM_BYTES && copyBytes > 0;
+        return { path: isCopy ? COPY : MODEL, bytes: isCopy ? copyBytes : modelBytes, modelBytes };
+    }
+
+    /** The path of a model for the viewer, and what is said about a copy. A model that is not finished is made. */
+    async function pathOf(live: Live, onStep: (text: string) => void): Promise<{ path: string; words: string }> {
         if (live.kind === 'finished') {
-            return MODEL;
+            const { path, bytes, modelBytes } = await fileOf();
+            const sizes = `${bytesText(bytes)} instead of ${bytesText(modelBytes)}`;
+            return { path, words: path === COPY ? `A copy for viewing: ${sizes}.` : '' };
         }
         models ??= readPlan().then((plan) => {
             if (plan === null) {
@@ -93,7 +124,7 @@ export function open(container: HTMLElement, context: JobContext): Section {
         );
         count += 1;
         made = { path: `${LIVE}${count}.ply`, bytes };
-        return made.path;
+        return { path: made.path, words: '' };
     }
 
     async function sceneOf(live: Live, onStep: (text: string) => void): Promise<Scene> {
@@ -105,9 +136,11 @@ export function open(container: HTMLElement, context: JobContext): Section {
             // Without photographs the model can still be seen.
             photographs.digests().catch(() => new Map<string, string>()),
         ]);
+        const { path, words } = await pathOf(live, onStep);
+        copyText = words;
         return {
             name: context.job.name === '' ? id : context.job.name,
-            model: await pathOf(live, onStep),
+            model: path,
             // Without a record, that among the comments of the model is taken.
             water: water as WaterRecord | null,
             cameras: cameras as CameraEntry[] | null,
@@ -169,17 +202,25 @@ export function open(container: HTMLElement, context: JobContext): Section {
         }
         isBusy = true;
         refresh.disabled = true;
+        whole.disabled = true;
+        // Only the button for the whole model asks for another file of the same model.
+        const which = live.key === shown?.key ? 'whole' : 'newer';
         try {
-            const path = await pathOf(live, (text) => setText(newText, text));
+            const { path, words } = await pathOf(live, (text) => setText(newText, text));
+            setText(newText, 'Loading …');
             await handle.replaceModel(path);
+            // Until now the line is about the model before.
+            copyText = words;
             shown = live;
         } catch (error) {
+            wantsWhole &&= copyText === '';
             const why =
                 error instanceof ViewerError ? `${error.message} ${error.remedy}` : faultOf(error).message;
-            context.say(`The newer model cannot be shown. ${why}`);
+            context.say(`The ${which} model cannot be shown. ${why}`);
         } finally {
             made = null;
             refresh.disabled = false;
+            whole.disabled = false;
             isBusy = false;
             drawLine();
         }
@@ -188,9 +229,11 @@ export function open(container: HTMLElement, context: JobContext): Section {
     function drawLine(): void {
         const newest = liveOf(context.job);
         const isNew = handle !== null && newest !== null && newest.key !== shown?.key;
+        const isCopy = shown?.kind === 'finished' && copyText !== '';
         // A viewer that was opened on the finished model needs no words.
-        line.hidden = shown?.kind === 'finished' && !isNew;
-        setText(shownText, shown === null ? '' : liveText(shown));
+        line.hidden = shown?.kind === 'finished' && !isNew && !isCopy;
+        setText(shownText, shown === null ? '' : isCopy ? copyText : liveText(shown));
+        whole.hidden = !isCopy || handle === null;
         if (!isBusy) {
             setText(newText, isNew ? `There is more: ${liveText(newest)}` : '');
         }
@@ -211,9 +254,7 @@ export function open(container: HTMLElement, context: JobContext): Section {
         isBusy = true;
         container.replaceChildren(loadingText('Loading the viewer …'));
         try {
-            const files = live.kind === 'finished' ? await context.files() : [];
-            const model = files.find(({ path }) => path === MODEL);
-            const bytes = live.kind === 'finished' ? Number(model?.blob?.sizeBytes ?? 0) : liveBytes(live);
+            const bytes = live.kind === 'finished' ? (await fileOf()).bytes : liveBytes(live);
             if (bytes < ASK_FROM_BYTES) {
                 await load(live);
                 return;

@@ -14,6 +14,9 @@ import { followHistory } from './history.ts';
 import type { JobContext, Section } from './section.ts';
 import { isInAir, waterSeriesOf } from './water-history.ts';
 
+/** After a failure the plan is asked for again, but not at once. */
+const ASK_AGAIN_MS = 5000;
+
 /** The keys of plan.json that are read. */
 interface Plan {
     readonly extent?: { readonly viewing_distance?: number | null };
@@ -30,7 +33,7 @@ function emptyText(context: JobContext): string {
 }
 
 export function open(container: HTMLElement, context: JobContext): Section {
-    const { signal } = context;
+    const { id, session, signal } = context;
     const finalHost = h('div', { class: 'section' });
     const settlingHost = h('div', { class: 'card' });
     const settlingTitle = h('h2', {}, 'How it settled');
@@ -40,6 +43,22 @@ export function open(container: HTMLElement, context: JobContext): Section {
     let settling: Part<WaterSettlingData> | null = null;
     let histories: readonly TaskHistory[] = [];
     let isFinalShown = false;
+    /** Of the plan; null before it is known. */
+    let viewingDistance: number | null = null;
+    let isPlanAsked = false;
+
+    /** Before the job has succeeded the plan is no file yet, only a blob. */
+    const askPlan = async (digest: string): Promise<void> => {
+        isPlanAsked = true;
+        try {
+            const plan = (await session.api.json(digest, id, signal)) as Plan | null;
+            viewingDistance = plan?.extent?.viewing_distance ?? null;
+            update();
+        } catch {
+            // Meanwhile the colours are shown at distances in scene units.
+            setTimeout(() => (isPlanAsked = false), ASK_AGAIN_MS);
+        }
+    };
 
     const showFinal = async (): Promise<void> => {
         isFinalShown = true;
@@ -73,6 +92,10 @@ export function open(container: HTMLElement, context: JobContext): Section {
         }
         const series = waterSeriesOf(tasks, histories);
         const isSettling = series.length > 0;
+        const { plan } = context.job;
+        if (isSettling && !hasFinal && plan !== undefined && !isPlanAsked) {
+            void askPlan(plan.digest);
+        }
         emptyWords.textContent = emptyText(context);
         const parts = [
             ...(hasFinal ? [finalHost] : []),
@@ -88,7 +111,7 @@ export function open(container: HTMLElement, context: JobContext): Section {
         }
         if (isSettling) {
             settling ??= waterSettling(settlingHost);
-            settling.update({ series });
+            settling.update({ series, showsColours: !hasFinal, viewingDistance });
         }
     }
 

@@ -1,6 +1,7 @@
 // The divider between two pictures that lie on each other: a slider that a pointer and keys move.
 
 import { h } from '../../viewer/dom.ts';
+import { setText } from './elements.ts';
 
 /** How far an arrow key moves it, as a share of the width. */
 const STEP = 0.02;
@@ -16,6 +17,8 @@ const STEPS: Readonly<Record<string, number>> = {
 };
 
 export class Divider {
+    readonly #leftTag = h('span', { class: 'fp-tag fp-tag-left', 'aria-hidden': 'true' });
+    readonly #rightTag = h('span', { class: 'fp-tag fp-tag-right', 'aria-hidden': 'true' });
     readonly element = h(
         'div',
         {
@@ -23,18 +26,19 @@ export class Divider {
             role: 'slider',
             tabindex: 0,
             hidden: true,
-            'aria-label': 'Divider between photograph and render',
             'aria-orientation': 'horizontal',
             'aria-valuemin': 0,
             'aria-valuemax': 100,
         },
         h('span', { class: 'fp-grip', 'aria-hidden': 'true' }),
-        h('span', { class: 'fp-tag fp-tag-left', 'aria-hidden': 'true' }, 'Photograph'),
-        h('span', { class: 'fp-tag fp-tag-right', 'aria-hidden': 'true' }, 'Render'),
+        this.#leftTag,
+        this.#rightTag,
     );
     readonly #stage: HTMLElement;
     readonly #right: HTMLElement;
     #share = 0.5;
+    /** The two pictures, within a sentence. */
+    #words: readonly [string, string] = ['photograph', 'render'];
 
     /** `right` is the upper picture on `stage`: it shows to the right of the divider. */
     constructor(stage: HTMLElement, right: HTMLElement) {
@@ -65,6 +69,14 @@ export class Divider {
         });
     }
 
+    /** Says which two pictures it divides: each on a tag, and within a sentence. */
+    name(left: readonly [string, string], right: readonly [string, string]): void {
+        setText(this.#leftTag, left[0]);
+        setText(this.#rightTag, right[0]);
+        this.#words = [left[1], right[1]];
+        this.element.setAttribute('aria-label', `Divider between ${left[1]} and ${right[1]}`);
+    }
+
     /** Puts it where it was. */
     draw(): void {
         this.#move(this.#share);
@@ -81,6 +93,6 @@ export class Divider {
         this.element.style.left = `${percent}%`;
         this.#right.style.clipPath = `inset(0 0 0 ${percent}%)`;
         this.element.setAttribute('aria-valuenow', String(Math.round(percent)));
-        this.element.setAttribute('aria-valuetext', `${Math.round(percent)} % photograph, then render`);
+        this.element.setAttribute('aria-valuetext', `${Math.round(percent)} % ${this.#words[0]}, then ${this.#words[1]}`);
     }
 }

@@ -9,12 +9,18 @@ import './parts.css';
 import { type GetPicture, NoPicture, type Part } from './part.ts';
 import { Pictures, drawThumbnail, pixels } from './pictures.ts';
 import {
+    ALL_SIDES,
     type ComparedView,
+    SIDE_WORDS,
     type Showing,
+    type Sides,
     difference,
     keyOf,
     meanDifference,
     possible,
+    possibleSides,
+    sidesOf,
+    sidesText,
     thumbnailOf,
     worstFirst,
 } from './view-difference.ts';
@@ -48,6 +54,8 @@ const NAMES: readonly (readonly [Showing, string])[] = [
     ['clear', 'Without water'],
 ];
 
+type SideWords = (typeof SIDE_WORDS)[keyof typeof SIDE_WORDS];
+
 interface Entry {
     readonly element: HTMLElement;
     readonly button: HTMLButtonElement;
@@ -79,6 +87,8 @@ class CompareViews implements Part<CompareData> {
     readonly #divider = new Divider(this.#stage, this.#right);
     readonly #options: CompareOptions;
     readonly #choice: Choice<Showing>;
+    readonly #sidesSelect: HTMLSelectElement;
+    readonly #sidesRow: HTMLElement;
     readonly #gain: HTMLInputElement;
     readonly #gainRow: HTMLElement;
     readonly #words = h('p', { class: 'fp-note' });
@@ -89,6 +99,10 @@ class CompareViews implements Part<CompareData> {
     #chosen: string | null = null;
     #shown: ComparedView | null = null;
     #showing: Showing = 'compare';
+    /** What the reader wants on both sides of the divider. */
+    #sides: Sides = 'photograph-render';
+    /** The pairs that can be chosen now. */
+    #sidesKey = '';
     /** Counts what is asked for, so that a slow picture does not replace a later one. */
     #turn = 0;
     #pair: { readonly a: ImageData; readonly b: ImageData } | null = null;
@@ -103,6 +117,20 @@ class CompareViews implements Part<CompareData> {
             this.#showing = value;
             void this.#show();
         });
+        const sidesId = freshId();
+        this.#sidesSelect = h('select', {
+            id: sidesId,
+            onchange: () => {
+                this.#sides = this.#sidesSelect.value as Sides;
+                void this.#show();
+            },
+        });
+        this.#sidesRow = h(
+            'div',
+            { class: 'fp-bar', hidden: true },
+            h('label', { for: sidesId }, 'Divider between'),
+            this.#sidesSelect,
+        );
         const id = freshId();
         const output = h('output', { for: id, class: 'fp-number' }, '4 ×');
         this.#gain = h('input', {
@@ -132,6 +160,7 @@ class CompareViews implements Part<CompareData> {
                 { class: 'fp-compare-main' },
                 h('header', { class: 'fp-compare-head' }, this.#title, this.#facts),
                 h('div', { class: 'fp-bar' }, this.#choice.element),
+                this.#sidesRow,
                 this.#gainRow,
                 options.controls ?? null,
                 this.#stage,
@@ -167,7 +196,11 @@ class CompareViews implements Part<CompareData> {
 
     #drawList(isByQuality: boolean): void {
         const measured = isByQuality && this.#views.some(({ psnr }) => psnr !== null);
-        const many = counted(this.#views.length, isByQuality ? 'photograph' : 'view');
+        // With keys of their own, several views may be of the same photograph.
+        const isOfPhotographs = this.#views.every(({ key }) => key === undefined);
+        const many = counted(this.#views.length, isOfPhotographs ? 'photograph' : 'view');
+        // An element that moves loses the focus.
+        const focused = this.#list.contains(document.activeElement) ? (document.activeElement as HTMLElement) : null;
         setText(this.#count, `${many}${measured ? ', worst PSNR first' : ''}`);
         const keys = new Set(this.#views.map(keyOf));
         for (const [key, { element, thumb }] of this.#entries) {
@@ -191,6 +224,9 @@ class CompareViews implements Part<CompareData> {
                 this.#list.insertBefore(entry.element, this.#list.children[i] ?? null);
             }
         });
+        if (focused !== null && focused !== document.activeElement) {
+            focused.focus({ preventScroll: true });
+        }
     }
 
     #makeEntry(key: string, name: string): Entry {
@@ -276,8 +312,13 @@ class CompareViews implements Part<CompareData> {
         }
         this.#choice.value = showing;
         this.#gainRow.hidden = showing !== 'difference';
-        const isBoth = showing === 'compare' || showing === 'difference';
-        const gets = isBoth ? [view.photograph!, view.render!] : [view[showing]!];
+        const sides = this.#offerSides(view, showing);
+        const gets =
+            showing === 'compare'
+                ? sidesOf(sides).map((side) => view[side]!)
+                : showing === 'difference'
+                  ? [view.photograph!, view.render!]
+                  : [view[showing]!];
         const announce = (): void => {
             if (turn === this.#turn) {
                 setText(this.#message, 'Loading …');
@@ -288,7 +329,7 @@ class CompareViews implements Part<CompareData> {
             const images = await Promise.all(gets.map((get) => this.#pictures.get(get)));
             if (turn === this.#turn) {
                 setText(this.#message, '');
-                this.#place(view, showing, images);
+                this.#place(view, showing, sides, images);
             }
         } catch (error) {
             if (turn === this.#turn) {
@@ -300,7 +341,23 @@ class CompareViews implements Part<CompareData> {
         }
     }
 
-    #place(view: ComparedView, showing: Showing, images: readonly HTMLImageElement[]): void {
+    /** Offers the pairs of a view, and returns the one to show: the wanted one if the view has it. */
+    #offerSides(view: ComparedView, showing: Showing): Sides {
+        const offered = possibleSides(view);
+        this.#sidesRow.hidden = showing !== 'compare' || offered.length < 2;
+        const key = offered.join(' ');
+        if (key !== this.#sidesKey) {
+            this.#sidesKey = key;
+            this.#sidesSelect.replaceChildren(
+                ...offered.map((sides) => h('option', { value: sides }, sidesText(sides))),
+            );
+        }
+        const sides = offered.includes(this.#sides) ? this.#sides : (offered[0] ?? ALL_SIDES[0]!);
+        this.#sidesSelect.value = sides;
+        return sides;
+    }
+
+    #place(view: ComparedView, showing: Showing, sides: Sides, images: readonly HTMLImageElement[]): void {
         const [first, second] = images;
         const frame = second ?? first!;
         // The render has the size of training; the photograph may be larger.
@@ -308,8 +365,9 @@ class CompareViews implements Part<CompareData> {
         // No higher than most of the window, without distorting it.
         this.#stage.style.maxWidth = `calc(75vh * ${(frame.naturalWidth / frame.naturalHeight).toFixed(4)})`;
         this.#display(showing);
+        const [left, right] = sidesOf(sides).map((side) => SIDE_WORDS[side]) as [SideWords, SideWords];
         const names: Record<Showing, string> = {
-            compare: 'The photograph on the left of the divider, the render on its right.',
+            compare: `The ${left[1]} on the left of the divider, the ${right[1]} on its right.`,
             photograph: 'The photograph, which was held out of the training.',
             render: 'The trained scene under its water, from the same camera.',
             difference: '',
@@ -322,10 +380,11 @@ class CompareViews implements Part<CompareData> {
             return;
         }
         this.#left.src = first!.src;
-        this.#left.alt = showing === 'compare' ? `Photograph ${view.name}` : `${names[showing]} ${view.name}`;
+        this.#left.alt = showing === 'compare' ? `${left[0]}, ${view.name}` : `${names[showing]} ${view.name}`;
         if (second !== undefined) {
             this.#right.src = second.src;
-            this.#right.alt = `Render of ${view.name}`;
+            this.#right.alt = `${right[0]}, ${view.name}`;
+            this.#divider.name(left, right);
             this.#divider.draw();
         }
     }

@@ -3,7 +3,7 @@
 import uPlot from 'uplot';
 
 import { h } from '../../viewer/dom.ts';
-import { colourReader } from './elements.ts';
+import { colourReader, setText } from './elements.ts';
 import { duration } from './format.ts';
 import { type Along, type ChartWords, type Line, joined, placeText, valueAt } from './curve-points.ts';
 
@@ -16,6 +16,10 @@ export interface DrawnLine {
     readonly dash: readonly number[];
     /** Thin and without a value below the chart: what the others are compared with. */
     readonly isBehind?: boolean;
+    /** An edge of a band, which is no line by itself; it is behind too. */
+    readonly isEdge?: boolean;
+    /** Of the upper edge of a band: the task of its lower edge. */
+    readonly bandTo?: string;
 }
 
 export interface Zoom {
@@ -38,6 +42,8 @@ const OPACITY_BEHIND = '80';
 const TIME_STEPS = [
     1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 10_800, 21_600, 43_200, 86_400, 172_800,
 ];
+/** How much of a band is seen. */
+const OPACITY_BAND = '2e';
 const FONT = '12px system-ui, sans-serif';
 
 /** Of the marks of a logarithm only 1, 2 and 5 times powers of ten; the rest would be a wall of lines. */
@@ -50,6 +56,7 @@ export class Chart {
     readonly element: HTMLElement;
     readonly #words: ChartWords;
     readonly #actions: ChartActions;
+    readonly #title = h('h3');
     readonly #place = h('span', { class: 'fp-curve-place' });
     readonly #stage: HTMLElement;
     readonly #readout = h('ul', { class: 'fp-curve-readout' });
@@ -65,18 +72,26 @@ export class Chart {
     constructor(words: ChartWords, actions: ChartActions) {
         this.#words = words;
         this.#actions = actions;
-        const { title } = words;
         this.#stage = h('div', {
             class: 'fp-curve-stage',
             tabindex: 0,
             role: 'application',
             'aria-roledescription': 'chart',
-            'aria-label': `${title}. Arrow keys move the cursor, + and − zoom, 0 shows everything.`,
             onkeydown: (event) => this.#press(event as KeyboardEvent),
             onblur: () => this.#actions.point(null),
         });
-        const head = h('header', { class: 'fp-curve-head' }, h('h3', {}, title), this.#place);
+        const head = h('header', { class: 'fp-curve-head' }, this.#title, this.#place);
         this.element = h('section', { class: 'fp-curve' }, head, this.#nothing, this.#stage, this.#readout);
+        this.call(words.title);
+    }
+
+    /** Gives the chart another title. */
+    call(title: string): void {
+        setText(this.#title, title);
+        this.#stage.setAttribute(
+            'aria-label',
+            `${title}. Arrow keys move the cursor, + and − zoom, 0 shows everything.`,
+        );
     }
 
     /** Draws lines; the zoom stays unless another is given. */
@@ -182,14 +197,25 @@ export class Chart {
             scales: { x: { time: false }, y: isLog ? { distr: 3 } : {} },
             series: [
                 {},
-                ...lines.map(({ label, colour: name, dash, line, isBehind }): uPlot.Series => ({
+                ...lines.map(({ label, colour: name, dash, line, isBehind, isEdge }): uPlot.Series => ({
                     label,
-                    stroke: `${colour(name)}${isBehind === true ? OPACITY_BEHIND : ''}`,
+                    stroke: isEdge === true ? 'transparent' : `${colour(name)}${isBehind === true ? OPACITY_BEHIND : ''}`,
                     width: isBehind === true ? WIDTH_BEHIND : WIDTH,
                     dash: [...dash],
-                    points: { show: hasPoints === true || line.xs.length < 3, size: 5, fill: colour(name) },
+                    points: {
+                        show: isEdge !== true && (hasPoints === true || line.xs.length < 3),
+                        size: 5,
+                        fill: colour(name),
+                    },
                 })),
             ],
+            // The first series is x.
+            bands: lines.flatMap(({ bandTo, colour: name }, upper): uPlot.Band[] => {
+                const lower = lines.findIndex(({ task }) => task === bandTo);
+                return lower < 0
+                    ? []
+                    : [{ series: [upper + 1, lower + 1], fill: `${colour(name)}${OPACITY_BAND}` }];
+            }),
             axes: [
                 {
                     ...axis,

@@ -28,6 +28,8 @@ export interface CurveSeries {
     readonly label: string;
     /** In the order in which they were reported. */
     readonly points: readonly CurvePoint[];
+    /** Mean PSNR of the previews after some iterations, dB, by ascending iteration. */
+    readonly previews?: readonly { readonly iteration: number; readonly psnr: number }[];
 }
 
 export interface CurvesData {
@@ -70,7 +72,9 @@ export const QUANTITIES: Readonly<Record<Quantity, ChartWords>> = {
         isLog: false,
         text: (value) => value.toFixed(2),
         axisText: (value) => String(Number(value.toFixed(2))),
-        nothing: 'Not measured yet. Held-out photographs are measured during training where train.eval_every is set.',
+        nothing:
+            'Not measured yet. Previews bring values from time to time, and train.eval_every measures all ' +
+            'held-out photographs.',
         hasPoints: true,
     },
     gaussians: {
@@ -139,6 +143,39 @@ export function lineOf(points: readonly CurvePoint[], quantity: Quantity, along:
         return isRepeated ? null : known;
     };
     return lineBy(points, value, along, startMs);
+}
+
+/** Whether the PSNR of a task is that of its previews: nothing else measured its held-out photographs. */
+export const isOfPreviews = ({ points, previews }: CurveSeries): boolean =>
+    (previews ?? []).length > 0 && points.every((point) => valueOf(point, 'psnr') === null);
+
+/** The previews of current points: those of an attempt that resumed earlier are to come. */
+export function currentPreviews({ points, previews }: CurveSeries): readonly { iteration: number; psnr: number }[] {
+    const last = points.at(-1)?.iteration ?? -Infinity;
+    return (previews ?? []).filter(({ iteration }) => iteration <= last);
+}
+
+/** The line of the PSNR of previews. Their times are between those of the points around them. */
+export function previewLine(series: CurveSeries, along: Along, startMs: number): Line {
+    const { points } = series;
+    const rounds = currentPreviews(series).map(({ iteration, psnr }) => {
+        const next = points.findIndex((point) => point.iteration >= iteration);
+        const [before, after] = [points[Math.max(0, next - 1)]!, points[next]!];
+        const span = after.iteration - before.iteration;
+        const share = span > 0 ? Math.max(0, (iteration - before.iteration) / span) : 0;
+        const timeMs = before.timeMs + share * (after.timeMs - before.timeMs);
+        return { timeMs, attempt: after.attempt, iteration, psnr };
+    });
+    return lineBy(rounds, ({ psnr }) => psnr, along, startMs);
+}
+
+/** What the chart of the PSNR is called, by the tasks that it shows. */
+export function psnrTitle(drawn: readonly CurveSeries[]): string {
+    const ofPreviews = drawn.filter(isOfPreviews).length;
+    if (ofPreviews === 0) {
+        return QUANTITIES.psnr.title;
+    }
+    return ofPreviews === drawn.length ? 'PSNR of previews, dB' : 'PSNR on held-out photographs or of previews, dB';
 }
 
 /**

@@ -14,8 +14,12 @@ import {
     QUANTITIES,
     type Quantity,
     currentPoints,
+    currentPreviews,
     firstDrawn,
+    isOfPreviews,
     lineOf,
+    previewLine,
+    psnrTitle,
     spanOf,
     startOf,
     valueOf,
@@ -215,12 +219,18 @@ class Curves implements Part<CurvesData> {
         // All charts show the same part of x, also where one of them has values for a part only.
         const whole = spanOf(drawn, this.#along, startMs);
         for (const [quantity, chart] of this.#charts) {
-            const lines = drawn.map(({ task, label, points }): DrawnLine => ({
-                task,
-                label,
-                line: lineOf(points, quantity, this.#along, startMs),
-                ...this.#looks.of(task),
-            }));
+            const lines = drawn.map((one): DrawnLine => {
+                const hasPreviews = quantity === 'psnr' && isOfPreviews(one);
+                return {
+                    task: one.task,
+                    label: hasPreviews ? `${one.label}, previews` : one.label,
+                    line: hasPreviews
+                        ? previewLine(one, this.#along, startMs)
+                        : lineOf(one.points, quantity, this.#along, startMs),
+                    ...this.#looks.of(one.task),
+                };
+            });
+            chart.call(quantity === 'psnr' ? psnrTitle(drawn) : QUANTITIES[quantity].title);
             chart.draw(lines, this.#along, whole, this.#zoom);
         }
         setText(this.#drawnWords, `${grouped(drawn.length)} of ${counted(this.#series.length, 'task')} drawn`);
@@ -298,15 +308,17 @@ class Curves implements Part<CurvesData> {
     }
 
     #rows(): string[][] {
-        return this.#series.map(({ label, points }) => {
+        return this.#series.map((series) => {
+            const { label, points } = series;
             const last = points.at(-1)!;
+            const preview = isOfPreviews(series) ? currentPreviews(series).at(-1) : undefined;
             return [
                 label,
                 clock(last.timeMs),
                 String(last.attempt),
                 grouped(last.iteration),
                 valueText(last, 'loss'),
-                valueText(last, 'psnr'),
+                preview === undefined ? valueText(last, 'psnr') : `${QUANTITIES.psnr.text(preview.psnr)} (previews)`,
                 valueText(last, 'gaussians'),
                 valueText(last, 'rate'),
                 valueText(last, 'memory'),

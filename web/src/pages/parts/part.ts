@@ -33,6 +33,23 @@ export interface TaskInfo {
     readonly attempts: number;
     /** Latest PSNR on held-out views, dB. */
     readonly psnr: number | null;
+    /** Mean PSNR of its latest previews, dB; absent or null where it is not known. */
+    readonly previewPsnr?: number | null;
+}
+
+/** A PSNR, and whether it is that of previews, which show few of the held-out views. */
+export interface ShownPsnr {
+    readonly value: number;
+    readonly isOfPreviews: boolean;
+}
+
+/** The latest PSNR of a task: as it was measured, otherwise that of its previews. */
+export function shownPsnr(task: Pick<TaskInfo, 'psnr' | 'previewPsnr'> | null): ShownPsnr | null {
+    const [measured, ofPreviews] = [task?.psnr ?? null, task?.previewPsnr ?? null];
+    if (measured !== null && Number.isFinite(measured)) {
+        return { value: measured, isOfPreviews: false };
+    }
+    return ofPreviews === null || !Number.isFinite(ofPreviews) ? null : { value: ofPreviews, isOfPreviews: true };
 }
 
 /** What a reader needs to know of a state; blocked and ready tasks both wait. */

@@ -10,6 +10,8 @@ import {
     camerasOf,
     seenBy,
 } from './plan-layout.ts';
+import type { ShadeBy } from './plan-shades.ts';
+import { shownPsnr } from './part.ts';
 
 /** Most cameras that are listed for a partition. */
 const MOST_LISTED = 60;
@@ -32,11 +34,7 @@ export class PlanDetails {
             this.#listed = null;
             this.#list.replaceChildren();
             this.#head.replaceChildren(
-                h(
-                    'p',
-                    { class: 'fp-note' },
-                    'Choose a partition on the map to see its worker, its progress and its cameras.',
-                ),
+                h('p', { class: 'fp-note' }, 'Choose a partition on the map to see its cameras and more.'),
             );
             return;
         }
@@ -89,8 +87,9 @@ function factsOf(partition: PlanPartition, { share, task, isFirstPart, state }: 
     if (task && task.attempts > 1) {
         facts.push(['Attempts', String(task.attempts)]);
     }
-    if (task && task.psnr !== null) {
-        facts.push(['PSNR', decibels(task.psnr)]);
+    const psnr = shownPsnr(task);
+    if (psnr !== null) {
+        facts.push([psnr.isOfPreviews ? 'PSNR of previews' : 'PSNR', decibels(psnr.value)]);
     }
     const filled = partition.filled_views > 0 ? `, ${partition.filled_views} of them see little of it` : '';
     facts.push(
@@ -103,11 +102,20 @@ function factsOf(partition: PlanPartition, { share, task, isFirstPart, state }: 
 }
 
 /** What the lines and the shades of the map mean. */
-export function meaningOf(showsCameraCounts: boolean, isDense: boolean): string {
-    if (showsCameraCounts) {
+export function meaningOf(by: ShadeBy, isDense: boolean): string {
+    if (by === 'cameras') {
         return (
             'Number and shade: cameras that see enough of the dashed box of a cell. Hatched: fewer than the least number, ' +
             'so the plan added cameras that see less of it. Expect lower quality there.'
+        );
+    }
+    if (by === 'worker') {
+        return 'Shade: the worker that trains a cell, or trained it last.';
+    }
+    if (by === 'psnr') {
+        return (
+            'Number and shade: the latest PSNR of a cell on held-out photographs. Where none was measured, it is that of ' +
+            'its latest previews. Lighter is better.'
         );
     }
     const zoom = isDense ? ' Zoom in to distinguish cameras.' : '';
@@ -135,6 +143,7 @@ export function tableRows(
 ): (string | Node)[][] {
     return (plan?.partitions ?? []).map((partition) => {
         const { state, task } = states.get(partition.id)!;
+        const psnr = shownPsnr(task);
         return [
             h(
                 'button',
@@ -145,7 +154,7 @@ export function tableRows(
             task?.worker ?? '',
             task ? `${grouped(task.iteration)} of ${grouped(task.iterations || partition.iterations)}` : '',
             String(task?.attempts ?? 0),
-            task === null || task.psnr === null ? '' : decibels(task.psnr),
+            psnr === null ? '' : `${decibels(psnr.value)}${psnr.isOfPreviews ? ' (previews)' : ''}`,
             String(partition.base_views.length),
             String(partition.chosen_views.length),
             String(seenBy(partition)),

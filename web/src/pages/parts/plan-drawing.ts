@@ -2,7 +2,7 @@
 // tens of thousands of cameras.
 
 import { decibels, percent } from './format.ts';
-import type { ShownState } from './part.ts';
+import { type ShownState, shownPsnr } from './part.ts';
 import {
     type CellState,
     type MapCamera,
@@ -11,16 +11,16 @@ import {
     type Projection,
     isCrowded,
     quietPlace,
-    seenBy,
 } from './plan-layout.ts';
 import { drawScale, scaleOf } from './plan-scale.ts';
+import { type Shade, type Shading, inkOn, mixed } from './plan-shades.ts';
 
 export interface MapPicture {
     readonly plan: PlanContent;
     readonly cameras: readonly MapCamera[];
     readonly states: ReadonlyMap<number, CellState>;
-    /** Shades cells by the cameras that see them instead of by their states. */
-    readonly showsCameraCounts: boolean;
+    /** How cells are shaded; null by their states. */
+    readonly shading: Shading | null;
     /** Cells whose extended boxes are drawn: the selected one and the one under the pointer. */
     readonly marked: readonly PlanPartition[];
     readonly camera: MapCamera | null;
@@ -51,11 +51,10 @@ export function drawMap(
 ): void {
     context.fillStyle = colour('--panel');
     context.fillRect(0, 0, width, height);
-    const most = Math.max(1, ...picture.plan.partitions.map(seenBy));
     for (const partition of picture.plan.partitions) {
         const rect = projection.rect(partition.cell);
         if (rect[2] > 0 && rect[0] < width && rect[3] > 0 && rect[1] < height) {
-            drawCell(context, clip(rect, width, height), rect, partition, picture, most, colour);
+            drawCell(context, clip(rect, width, height), rect, partition, picture, colour);
         }
     }
     drawFailures(context, projection, picture, colour);
@@ -96,21 +95,12 @@ function drawCell(
     whole: Rect,
     partition: PlanPartition,
     picture: MapPicture,
-    most: number,
     colour: (name: string) => string,
 ): void {
     const { state, share } = picture.states.get(partition.id)!;
     const [w, h] = [right - left, bottom - top];
-    if (picture.showsCameraCounts) {
-        context.fillStyle = colour('--panel');
-        context.fillRect(left, top, w, h);
-        context.globalAlpha = 0.1 + 0.5 * (seenBy(partition) / most);
-        context.fillStyle = colour('--accent');
-        context.fillRect(left, top, w, h);
-        context.globalAlpha = 1;
-        if (partition.filled_views > 0) {
-            hatch(context, [left, top, right, bottom], colour('--warn'));
-        }
+    if (picture.shading !== null) {
+        fillShade(context, [left, top, right, bottom], picture.shading.of(partition).shade, colour);
     } else {
         context.fillStyle = colour(`--${state === 'running' ? 'waiting' : state}-fill`);
         context.fillRect(left, top, w, h);
@@ -134,6 +124,25 @@ function drawCell(
     context.globalAlpha = 1;
 }
 
+/** The colour of a shade on the ground of the map, as #rrggbb. */
+const fillOf = ({ fill, share }: Shade, colour: (name: string) => string): string =>
+    mixed(colour('--panel'), fill.startsWith('--') ? colour(fill) : fill, share);
+
+function fillShade(context: Context, rect: Rect, shade: Shade, colour: (name: string) => string): void {
+    const [left, top, right, bottom] = rect;
+    context.fillStyle = fillOf(shade, colour);
+    context.fillRect(left, top, right - left, bottom - top);
+    if (shade.pattern !== 'plain') {
+        // Lines of the ink would hide words that have the same ink.
+        context.globalAlpha = shade.stroke === '--ink' ? 0.45 : 1;
+        hatch(context, rect, colour(shade.stroke));
+        if (shade.pattern === 'crossed') {
+            hatch(context, rect, colour(shade.stroke), true);
+        }
+        context.globalAlpha = 1;
+    }
+}
+
 /** Outlines of failed cells, inside of them, so that neighbours do not cover them. */
 function drawFailures(
     context: Context,
@@ -141,7 +150,7 @@ function drawFailures(
     picture: MapPicture,
     colour: (name: string) => string,
 ): void {
-    if (picture.showsCameraCounts) {
+    if (picture.shading !== null) {
         return;
     }
     context.strokeStyle = colour('--failed');
@@ -154,7 +163,7 @@ function drawFailures(
     }
 }
 
-function hatch(context: Context, [left, top, right, bottom]: Rect, stroke: string): void {
+function hatch(context: Context, [left, top, right, bottom]: Rect, stroke: string, isMirrored = false): void {
     const step = Math.min(8, Math.max(3, (right - left) / 4));
     context.save();
     context.beginPath();
@@ -162,9 +171,11 @@ function hatch(context: Context, [left, top, right, bottom]: Rect, stroke: strin
     context.clip();
     context.beginPath();
     // Through multiples of the step, so that the lines of neighbours meet.
-    for (let at = Math.floor((left + top) / step) * step; at < right + bottom; at += step) {
-        context.moveTo(at - top, top);
-        context.lineTo(at - bottom, bottom);
+    const [start, end] = isMirrored ? [left - bottom, right - top] : [left + top, right + bottom];
+    const lean = isMirrored ? -1 : 1;
+    for (let at = Math.floor(start / step) * step; at < end; at += step) {
+        context.moveTo(at - lean * top, top);
+        context.lineTo(at - lean * bottom, bottom);
     }
     context.strokeStyle = stroke;
     context.lineWidth = 1;
@@ -184,15 +195,17 @@ function drawWords(
     const [w, h] = [right - left, bottom - top];
     const fits = ([least, high]: readonly [number, number]): boolean => w >= least && h >= high;
     const [x, y] = [(left + right) / 2, (top + bottom) / 2];
-    if (picture.showsCameraCounts) {
-        if (fits(ROOM_FOR_NUMBER) && !fits(ROOM_FOR_STATE)) {
-            context.fillStyle = colour('--ink');
+    if (picture.shading !== null) {
+        const { shade, words, number } = picture.shading.of(partition);
+        if (fits(ROOM_FOR_STATE)) {
+            const lines = [`${partition.id}`, shorten(words, Math.floor(w / 8))];
+            pill(context, lines, [left, top, right, bottom], cameras, colour('--ink'), colour);
+        } else if (fits(ROOM_FOR_NUMBER)) {
+            context.fillStyle = inkOn(fillOf(shade, colour));
             context.font = '11px system-ui, sans-serif';
             context.textAlign = 'center';
             context.textBaseline = 'middle';
-            context.fillText(String(seenBy(partition)), x, y + 0.5);
-        } else if (fits(ROOM_FOR_STATE)) {
-            pill(context, [String(seenBy(partition))], [left, top, right, bottom], cameras, colour('--ink'), colour);
+            context.fillText(number, x, y + 0.5);
         }
         return;
     }
@@ -200,12 +213,13 @@ function drawWords(
     const word = cell.isFirstPart && cell.state === 'running' ? 'first part' : cell.state;
     if (fits(ROOM_FOR_ALL)) {
         const lines = [`${partition.id}`, cell.state === 'running' ? `${word} ${percent(cell.share)}` : word];
-        const { worker, psnr } = cell.task ?? { worker: null, psnr: null };
+        const worker = cell.task?.worker ?? null;
+        const psnr = shownPsnr(cell.task);
         if (worker !== null && cell.state !== 'waiting') {
             lines.push(worker);
         }
         if (psnr !== null) {
-            lines.push(decibels(psnr));
+            lines.push(`${decibels(psnr.value)}${psnr.isOfPreviews ? ', previews' : ''}`);
         }
         const shown = lines.map((line) => shorten(line, Math.floor(w / 8)));
         pill(context, shown, [left, top, right, bottom], cameras, ink, colour);
@@ -329,19 +343,36 @@ function drawCameras(
             .filter(({ x, y }) => x > -20 && y > -20 && x < width + 20 && y < height + 20);
         context.strokeStyle = ink;
         context.lineWidth = Math.max(0.75, r * 0.45);
-        if (!(crowded && isFaint)) {
+        const drawDirections = (): void => {
             context.beginPath();
             for (const { camera, x, y } of places) {
                 context.moveTo(x, y);
                 context.lineTo(x + camera.dx * 4 * r, y - camera.dz * 4 * r);
             }
             context.stroke();
+        };
+        const drawDots = (size: number): void => {
+            context.beginPath();
+            for (const { x, y } of places) {
+                context.moveTo(x + size, y);
+                context.arc(x, y, size, 0, 2 * Math.PI);
+            }
+        };
+        const hasDirections = !(crowded && isFaint);
+        if (picture.shading !== null && !isFaint) {
+            // A rim, since shades may be as dark or as light as the ink.
+            const { lineWidth } = context;
+            [context.strokeStyle, context.fillStyle] = [colour('--panel'), colour('--panel')];
+            context.lineWidth = lineWidth + 2;
+            drawDirections();
+            drawDots(r + 1);
+            context.fill();
+            [context.strokeStyle, context.lineWidth] = [ink, lineWidth];
         }
-        context.beginPath();
-        for (const { x, y } of places) {
-            context.moveTo(x + r, y);
-            context.arc(x, y, r, 0, 2 * Math.PI);
+        if (hasDirections) {
+            drawDirections();
         }
+        drawDots(r);
         const isRing = group === 'heldOut' && !crowded;
         context.fillStyle = isRing ? colour('--panel') : ink;
         context.fill();

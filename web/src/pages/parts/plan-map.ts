@@ -2,7 +2,7 @@
 
 import { freshId, h } from '../../viewer/dom.ts';
 import type { CameraEntry } from '../../viewer/scene.ts';
-import { checkbox, colourReader, foldedTable, oncePerFrame, setText, watchLook } from './elements.ts';
+import { colourReader, foldedTable, oncePerFrame, setText, watchLook } from './elements.ts';
 import { counted, grouped, percent } from './format.ts';
 import './parts.css';
 import './plan-map.css';
@@ -31,6 +31,7 @@ import {
     placeCameras,
     project,
 } from './plan-layout.ts';
+import { type LegendEntry, SHADE_WORDS, type ShadeBy, type Shading, WorkerShades, shadingOf } from './plan-shades.ts';
 import { PlanTip } from './plan-tip.ts';
 
 export interface PlanMapOptions {
@@ -59,6 +60,14 @@ export function planMap(container: HTMLElement, options: PlanMapOptions = {}): P
 const button = (text: string, label: string, onclick: () => void): HTMLButtonElement =>
     h('button', { type: 'button', class: 'fp-button', 'aria-label': label, onclick }, text);
 
+function legendItem({ shade, text }: LegendEntry): HTMLElement {
+    const swatch = h('span', { class: 'fp-shade', 'data-pattern': shade.pattern, 'aria-hidden': 'true' });
+    const fill = shade.fill.startsWith('--') ? `var(${shade.fill})` : shade.fill;
+    swatch.style.backgroundColor = `color-mix(in srgb, ${fill} ${100 * shade.share}%, var(--panel))`;
+    swatch.style.color = `var(${shade.stroke})`;
+    return h('li', {}, swatch, text);
+}
+
 class PlanMap implements Part<PlanMapData> {
     readonly element = h('div', { class: 'fp fp-plan' });
     readonly #canvas: HTMLCanvasElement;
@@ -76,7 +85,9 @@ class PlanMap implements Part<PlanMapData> {
         'The plan is shown here as soon as the scene is cut into partitions.',
     );
     readonly #whole: HTMLButtonElement;
-    readonly #countsBox: { element: HTMLElement; input: HTMLInputElement };
+    readonly #shadeBy: HTMLSelectElement;
+    readonly #legend = h('ul', { class: 'fp-shades', 'aria-label': 'Shades of the cells' });
+    readonly #workers = new WorkerShades();
     readonly #table = foldedTable(
         'The plan as a table',
         'Partitions of the plan',
@@ -103,6 +114,9 @@ class PlanMap implements Part<PlanMapData> {
     #chosen: number | null = null;
     #hovered: PlanPartition | null = null;
     #camera: MapCamera | null = null;
+    #shading: Shading | null = null;
+    /** What the legend shows. */
+    #legendKey = '';
 
     constructor(options: PlanMapOptions) {
         this.#tip = new PlanTip(options.onPhotograph ?? null);
@@ -114,7 +128,12 @@ class PlanMap implements Part<PlanMapData> {
             'aria-roledescription': 'map',
             'aria-describedby': hint,
         });
-        this.#countsBox = checkbox('Areas that few cameras see', () => this.#showMeaning());
+        const shadeId = freshId();
+        this.#shadeBy = h(
+            'select',
+            { id: shadeId, onchange: () => this.#shade() },
+            ...SHADE_WORDS.map(([value, text]) => h('option', { value }, text)),
+        );
         this.#whole = button('Whole plan', 'Show the whole plan', () => this.#look({ ...this.#view, zoom: 1 }));
         const stage = h('div', { class: 'fp-plan-stage' }, this.#canvas, this.#tip.element);
         this.#body = h(
@@ -124,7 +143,8 @@ class PlanMap implements Part<PlanMapData> {
             h(
                 'div',
                 { class: 'fp-bar' },
-                this.#countsBox.element,
+                h('label', { for: shadeId }, 'Shade cells by'),
+                this.#shadeBy,
                 h('span', { class: 'fp-fill' }),
                 h(
                     'span',
@@ -134,6 +154,7 @@ class PlanMap implements Part<PlanMapData> {
                     this.#whole,
                 ),
             ),
+            this.#legend,
             h('div', { class: 'fp-plan-pair' }, stage, this.#details.element),
             this.#meaning,
             this.#spoken,
@@ -186,7 +207,7 @@ class PlanMap implements Part<PlanMapData> {
             }
         }
         this.#states = cellStates(plan, data.tasks);
-        this.#showMeaning();
+        this.#shade();
         setText(this.#summary, summaryOf(plan, this.#cameras.length));
         const counts = countStates(this.#states.values());
         const shown = SHOWN_STATES.filter((state) => counts[state] > 0);
@@ -195,6 +216,8 @@ class PlanMap implements Part<PlanMapData> {
                 h('li', { class: 'fp-state', 'data-state': state }, `${grouped(counts[state])} ${state}`),
             ),
         );
+        // Before there is a job, nothing waits.
+        this.#counts.hidden = data.tasks.length === 0;
         const words = shown.map((state) => `${counts[state]} ${state}`).join(', ');
         this.#canvas.setAttribute(
             'aria-label',
@@ -252,7 +275,7 @@ class PlanMap implements Part<PlanMapData> {
                 plan,
                 cameras: this.#cameras,
                 states: this.#states,
-                showsCameraCounts: this.#countsBox.input.checked,
+                shading: this.#shading,
                 marked: [...new Set(marked.toReversed())],
                 camera: this.#camera,
                 pixelsPerCamera: pixelsPerCamera(this.#area, this.#projection(), this.#cameras),
@@ -355,9 +378,25 @@ class PlanMap implements Part<PlanMapData> {
         this.#frame.request();
     }
 
+    /** Shades the cells anew, and says what the shades mean. */
+    #shade(): void {
+        const plan = this.#data?.plan ?? null;
+        this.#shading =
+            plan === null ? null : shadingOf(this.#shadeBy.value as ShadeBy, plan, this.#states, this.#workers);
+        const legend = this.#shading?.legend ?? [];
+        const key = JSON.stringify(legend);
+        if (key !== this.#legendKey) {
+            this.#legendKey = key;
+            this.#legend.replaceChildren(...legend.map(legendItem));
+        }
+        // The states are told above the map.
+        this.#legend.hidden = legend.length === 0;
+        this.#showMeaning();
+    }
+
     #showMeaning(): void {
         const isDense = isCrowded(pixelsPerCamera(this.#area, this.#projection(), this.#cameras));
-        setText(this.#meaning, meaningOf(this.#countsBox.input.checked, isDense));
+        setText(this.#meaning, meaningOf(this.#shadeBy.value as ShadeBy, isDense));
         this.#frame.request();
     }
 

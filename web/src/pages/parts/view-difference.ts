@@ -67,6 +67,35 @@ export function meanDifference(a: Uint8ClampedArray, b: Uint8ClampedArray): numb
 
 export type Showing = 'compare' | 'photograph' | 'render' | 'difference' | 'clear';
 
+/** Two pictures with a divider between them, the left one first. */
+export type Sides = 'photograph-render' | 'photograph-clear' | 'render-clear';
+type Side = 'photograph' | 'render' | 'clear';
+const SIDES: Readonly<Record<Sides, readonly [Side, Side]>> = {
+    'photograph-render': ['photograph', 'render'],
+    'photograph-clear': ['photograph', 'clear'],
+    'render-clear': ['render', 'clear'],
+};
+/** What readers call a picture: on a tag, and within a sentence. */
+export const SIDE_WORDS: Readonly<Record<Side, readonly [string, string]>> = {
+    photograph: ['Photograph', 'photograph'],
+    render: ['Render', 'render'],
+    clear: ['Without water', 'scene without water'],
+};
+export const ALL_SIDES = Object.keys(SIDES) as Sides[];
+
+/** The left and the right picture. */
+export const sidesOf = (sides: Sides): readonly [Side, Side] => SIDES[sides];
+
+/** "Photograph and render", "Render and scene without water". */
+export function sidesText(sides: Sides): string {
+    const [left, right] = SIDES[sides];
+    return `${SIDE_WORDS[left][0]} and ${SIDE_WORDS[right][1]}`;
+}
+
+/** The pairs of a view that have both pictures. */
+export const possibleSides = (view: ComparedView): Sides[] =>
+    ALL_SIDES.filter((sides) => SIDES[sides].every((side) => view[side] !== null));
+
 /** What can be shown of a view. */
 export function possible(view: ComparedView): Set<Showing> {
     const can = new Set<Showing>();
@@ -77,7 +106,10 @@ export function possible(view: ComparedView): Set<Showing> {
         can.add('render');
     }
     if (can.size === 2) {
-        can.add('compare').add('difference');
+        can.add('difference');
+    }
+    if (possibleSides(view).length > 0) {
+        can.add('compare');
     }
     if (view.clear !== null) {
         can.add('clear');

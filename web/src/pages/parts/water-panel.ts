@@ -196,7 +196,8 @@ function bar({ channel, value, error }: WaterValue, most: number): SVGSVGElement
     return picture;
 }
 
-function colourTable(water: WaterContent, viewingDistance: number | null): HTMLElement {
+/** What a water does to known colours. `whose` says of which moment of the training it is. */
+export function colourTable(water: WaterContent, viewingDistance: number | null, whose = ''): HTMLElement {
     const unit = viewingDistance ?? 1;
     const metres = water.metres_per_unit;
     const heads = DISTANCES.map((times) => {
@@ -242,7 +243,7 @@ function colourTable(water: WaterContent, viewingDistance: number | null): HTMLE
         'section',
         { class: 'fp-water-colours' },
         h('h3', {}, 'What this water does to colours'),
-        h('p', { class: 'fp-note' }, about),
+        h('p', { class: 'fp-note' }, whose === '' ? about : `${whose} ${about}`),
         h(
             'div',
             { class: 'fp-scroll' },

@@ -1,8 +1,8 @@
 // The water of tasks while it is trained, as plain numbers: what a chart draws, and how partitions differ.
 
 import type { Vec3 } from '../../viewer/vector.ts';
-import type { Moment } from './curve-points.ts';
-import { PARAMETERS, type Parameter } from './water-values.ts';
+import type { Line, Moment } from './curve-points.ts';
+import { PARAMETERS, type Parameter, type WaterContent } from './water-values.ts';
 
 /** The water parameters of a task at one moment. */
 export interface WaterPoint extends Moment {
@@ -34,6 +34,79 @@ export const isTrained = ({ points }: WaterSeries): boolean =>
 export function firstShown(series: readonly WaterSeries[]): WaterSeries | null {
     const stage = series.findLast(isTrained)?.stage;
     return series.find((one) => one.stage === stage && isTrained(one)) ?? series[0] ?? null;
+}
+
+/** A water with the numbers of one moment, as `patch` takes it; what else water.json says is not known yet. */
+export const waterAt = ({ beta_d, beta_b, b_inf }: WaterPoint): WaterContent => ({
+    format: 2,
+    medium: 'per_pixel',
+    blend: 'srgb',
+    beta_d,
+    beta_b,
+    b_inf,
+});
+
+/** The lowest, the highest and the mean value of several tasks along the iterations. */
+export interface Band {
+    readonly lowest: Line;
+    readonly highest: Line;
+    readonly mean: Line;
+}
+
+/** Most places of a band: thousands of tasks may have hundreds of points each. */
+const MOST_PLACES = 200;
+
+/** Where a band has values: at the points of the tasks, or evenly where these are many. */
+function placesOf(series: readonly WaterSeries[]): readonly number[] {
+    const all = [...new Set(series.flatMap(({ points }) => points.map(({ iteration }) => iteration)))];
+    all.sort((a, b) => a - b);
+    if (all.length <= MOST_PLACES) {
+        return all;
+    }
+    const [first, last] = [all[0]!, all.at(-1)!];
+    return Array.from({ length: MOST_PLACES }, (_, i) => first + ((last - first) * i) / (MOST_PLACES - 1));
+}
+
+/** The value of a task at ascending places, between its points; null before the first and after the last. */
+function valuesAt(
+    { points }: WaterSeries,
+    valueOf: (point: WaterPoint) => number,
+    places: readonly number[],
+): readonly (number | null)[] {
+    let next = 0;
+    return places.map((place) => {
+        while (next < points.length && points[next]!.iteration < place) {
+            next += 1;
+        }
+        const [before, after] = [points[next - 1], points[next]];
+        if (after === undefined || (before === undefined && after.iteration > place)) {
+            return null;
+        }
+        if (before === undefined || after.iteration === place) {
+            return valueOf(after);
+        }
+        const share = (place - before.iteration) / (after.iteration - before.iteration);
+        return valueOf(before) + share * (valueOf(after) - valueOf(before));
+    });
+}
+
+/** The band of a value over the tasks that have reached each place; null where no two tasks share a place. */
+export function bandOf(series: readonly WaterSeries[], valueOf: (point: WaterPoint) => number): Band | null {
+    const places = placesOf(series);
+    const all = series.map((one) => valuesAt(one, valueOf, places));
+    const xs: number[] = [];
+    const [lowest, highest, mean]: [number[], number[], number[]] = [[], [], []];
+    places.forEach((place, i) => {
+        const values = all.map((one) => one[i]!).filter((value) => value !== null);
+        if (values.length > 1) {
+            xs.push(place);
+            lowest.push(Math.min(...values));
+            highest.push(Math.max(...values));
+            mean.push(values.reduce((sum, value) => sum + value, 0) / values.length);
+        }
+    });
+    const line = (ys: number[]): Line => ({ xs, ys });
+    return xs.length === 0 ? null : { lowest: line(lowest), highest: line(highest), mean: line(mean) };
 }
 
 /** How far the latest values of one parameter and channel lie apart. */

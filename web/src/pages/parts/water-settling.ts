@@ -15,18 +15,23 @@ import {
     type Spread,
     type WaterPoint,
     type WaterSeries,
+    bandOf,
     firstShown,
     spreadOfPartitions,
+    waterAt,
 } from './water-points.ts';
+import { colourTable } from './water-panel.ts';
 import { CHANNELS, PARAMETERS, type Parameter } from './water-values.ts';
 
 export interface WaterSettlingData {
     /** In the order of the tasks. */
     readonly series: readonly WaterSeries[];
+    /** Whether the colours that the latest water makes are shown. */
+    readonly showsColours?: boolean;
+    /** `extent.viewing_distance` of plan.json, scene units. */
+    readonly viewingDistance?: number | null;
 }
 
-/** Most tasks whose lines are drawn behind those of the chosen one. */
-const MOST_BEHIND = 24;
 /** Short, so that the three charts fit beside each other. */
 const TITLES: Readonly<Record<Parameter, string>> = {
     beta_d: 'Attenuation, 1/scene unit',
@@ -58,12 +63,28 @@ const spreadCell = ({ lowest, highest, share }: Spread): Node =>
         share === null ? null : h('small', {}, ` ${percent(share)} apart`),
     );
 
+/** The spread of one channel between tasks, and their mean; nothing for one task, and where all agree. */
+function bandLines(series: readonly WaterSeries[], name: Parameter, channel: number): DrawnLine[] {
+    const band = bandOf(series, (point) => point[name][channel]!);
+    if (band === null || band.highest.ys.every((value, i) => value === band.lowest.ys[i])) {
+        return [];
+    }
+    const common = { label: '', colour: COLOURS[channel]!, dash: [], isBehind: true };
+    const [lowest, highest] = [`lowest ${channel}`, `highest ${channel}`];
+    return [
+        { ...common, task: lowest, line: band.lowest, isEdge: true },
+        { ...common, task: highest, line: band.highest, isEdge: true, bandTo: lowest },
+        { ...common, task: `mean ${channel}`, line: band.mean, dash: [4, 3] },
+    ];
+}
+
 class WaterSettling implements Part<WaterSettlingData> {
     readonly element = h('div', { class: 'fp fp-water' });
     readonly #select: HTMLSelectElement;
     readonly #picker: HTMLElement;
     readonly #about = h('p', { class: 'fp-note fp-curve-hint' });
     readonly #charts: ReadonlyMap<Parameter, Chart>;
+    readonly #colours = h('div', { class: 'fp-water-now', hidden: true });
     readonly #spread = h('section', { class: 'fp-water-spread', hidden: true });
     readonly #table = foldedTable(
         'The latest water of each task as a table',
@@ -78,6 +99,9 @@ class WaterSettling implements Part<WaterSettlingData> {
     readonly #frame = oncePerFrame(() => this.#charts.forEach((chart) => chart.showPlace(this.#x)));
     readonly #stop: () => void;
     #series: readonly WaterSeries[] = [];
+    #data: WaterSettlingData = { series: [] };
+    /** Of which moment the colours are. */
+    #coloursOf = '';
     #options = '';
     #isChosen = false;
     #zoom: Zoom | null = null;
@@ -108,14 +132,16 @@ class WaterSettling implements Part<WaterSettlingData> {
             this.#picker,
             this.#about,
             h('div', { class: 'fp-water-grid fp-water-curves' }, ...charts.map(({ element }) => element)),
+            this.#colours,
             this.#spread,
             this.#table.element,
         );
         this.#stop = watchLook(this.element, () => this.#look());
     }
 
-    update({ series }: WaterSettlingData): void {
-        this.#series = series
+    update(data: WaterSettlingData): void {
+        this.#data = data;
+        this.#series = data.series
             .map((one) => ({ ...one, points: currentPoints(one.points) }))
             .filter(({ points }) => points.length > 0);
         const options = this.#series.map(({ task }) => task).join(' ');
@@ -159,31 +185,43 @@ class WaterSettling implements Part<WaterSettlingData> {
         if (shown === undefined) {
             return;
         }
-        const behind = this.#series
-            .filter((one) => one !== shown && one.stage === shown.stage)
-            .slice(0, MOST_BEHIND);
+        const ofStage = this.#series.filter((one) => one.stage === shown.stage);
         const last = shown.points.at(-1)!;
-        const others =
-            behind.length === 0 ? '' : ` Thin lines: ${counted(behind.length, 'other task')} of this stage.`;
         const place = `${shown.label} at iteration ${grouped(last.iteration)}.`;
-        setText(this.#about, `${place} Lines are red, green and blue light.${others}`);
-        const whole = spanOf([shown, ...behind], 'iteration', 0);
+        const whole = spanOf(ofStage, 'iteration', 0);
+        let hasBands = false;
         for (const [name, chart] of this.#charts) {
             // What is drawn last lies on top.
-            const lines = [...behind, shown].flatMap((one) =>
-                CHANNELS.map((channel, i): DrawnLine => ({
-                    task: `${one.task} ${channel}`,
-                    label: channel,
-                    line: lineBy(one.points, (point) => point[name][i]!, 'iteration', 0),
-                    colour: COLOURS[i]!,
-                    dash: [],
-                    isBehind: one !== shown,
-                })),
-            );
-            chart.draw(lines, 'iteration', whole, this.#zoom);
+            const bands = CHANNELS.flatMap((_, i) => bandLines(ofStage, name, i));
+            hasBands ||= bands.length > 0;
+            const own = CHANNELS.map((channel, i): DrawnLine => ({
+                task: `${shown.task} ${channel}`,
+                label: channel,
+                line: lineBy(shown.points, (point) => point[name][i]!, 'iteration', 0),
+                colour: COLOURS[i]!,
+                dash: [],
+            }));
+            chart.draw([...bands, ...own], 'iteration', whole, this.#zoom);
         }
+        const others = hasBands
+            ? ` Bands: lowest to highest of ${counted(ofStage.length, 'task')} of this stage, dashed: their mean.`
+            : '';
+        setText(this.#about, `${place} Lines are red, green and blue light.${others}`);
+        this.#drawColours(shown, last);
         this.#drawSpread();
         this.#table.refresh();
+    }
+
+    #drawColours(shown: WaterSeries, last: WaterPoint): void {
+        const { showsColours = false, viewingDistance = null } = this.#data;
+        this.#colours.hidden = !showsColours;
+        const key = `${shown.task} ${last.attempt} ${last.iteration} ${viewingDistance}`;
+        // Made only for another water, so that a selection stays.
+        if (showsColours && key !== this.#coloursOf) {
+            this.#coloursOf = key;
+            const whose = `The latest water of ${shown.label}, at iteration ${grouped(last.iteration)}.`;
+            this.#colours.replaceChildren(colourTable(waterAt(last), viewingDistance, whose));
+        }
     }
 
     #drawSpread(): void {

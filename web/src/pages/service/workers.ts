@@ -7,7 +7,8 @@ import { type Context, problemOf } from '../context.ts';
 import { ask } from '../dialog.ts';
 import { Table, chip, h, only, setAttribute, setText } from '../dom.ts';
 import { faultOf } from '../faults.ts';
-import { agoText, bytesText } from '../format.ts';
+import { agoText, bytesText, timeText } from '../format.ts';
+import { brief } from '../parts/format.ts';
 import { poll } from '../poll.ts';
 import { jobLink } from '../route.ts';
 import { capital, taskLabel, workerStateWord } from '../words.ts';
@@ -30,6 +31,25 @@ function showState(cell: HTMLElement, worker: Worker): void {
     const box = only(cell, () => h('div', {}, h('span'), h('div', { class: 'soft' })));
     chip(box.children[0] as HTMLElement, word, capital(word));
     setText(box.children[1] as HTMLElement, worker.reason);
+}
+
+/** Iterations per second in three digits; nothing where nothing is trained. */
+export const rateText = (perSecond: number): string =>
+    Number.isFinite(perSecond) && perSecond > 0 ? `${brief(perSecond)} /s` : '';
+
+/** The latest line of a worker, and when it logged it: as text, since a title is for the mouse only. */
+function showLastWords(cell: HTMLElement, { lastWords, lastWordsTime }: Worker, now: number): void {
+    if (lastWords === '') {
+        cell.replaceChildren();
+        return;
+    }
+    const box = only(cell, () => h('div', {}, h('span'), ' ', h('time', { class: 'soft' })));
+    const [words, time] = [box.children[0] as HTMLElement, box.children[1] as HTMLElement];
+    setText(words, lastWords);
+    const at = lastWordsTime === undefined ? null : timestampMs(lastWordsTime);
+    setText(time, at === null ? '' : agoText(at, now));
+    setAttribute(time, 'datetime', at === null ? null : new Date(at).toISOString());
+    setAttribute(time, 'title', at === null ? null : timeText(at));
 }
 
 function makeButtons(context: Context, worker: () => Worker, changed: () => void): HTMLElement {
@@ -107,6 +127,8 @@ export function showWorkers(container: HTMLElement, context: Context): void {
                 show: (cell, { memoryBytes }) => setText(cell, memoryBytes === 0n ? 'not reported' : bytesText(memoryBytes)),
             },
             { title: 'Works on', show: showHeld },
+            { title: 'Rate', kind: 'number', show: (cell, worker) => setText(cell, rateText(worker.iterationsPerSecond)) },
+            { title: 'Last words', kind: 'words', show: (cell, worker) => showLastWords(cell, worker, now) },
             {
                 title: 'Last seen',
                 kind: 'number',

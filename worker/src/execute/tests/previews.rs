@@ -34,11 +34,25 @@ fn a_task_makes_the_previews_of_its_spec_when_they_are_due() {
         for jpeg in [Some(&picture.render), picture.clear.as_ref()].into_iter().flatten() {
             assert!(jpeg.starts_with(&[0xff, 0xd8]) && jpeg.ends_with(&[0xff, 0xd9]), "no JPEG");
         }
+        // That of the held-out measurement at the same size.
+        let index = if picture.view == "0.png" { 0 } else { 2 };
+        let one = input.views_of(&[index], &[], 480, 0).unwrap();
+        let measured = run.measure(one.as_ref(), &|| true).unwrap().unwrap().psnr_db;
+        let shown = picture.psnr_db.unwrap();
+        assert!((shown - measured).abs() < 0.5, "{}: {shown} dB, measured {measured} dB", picture.view);
     }
     assert!(previews.make(run.as_mut(), &|| true).is_none(), "the next ones are due later");
     previews.due_now();
     let stopped = previews.make(run.as_mut(), &|| false).unwrap();
     assert!(stopped.is_empty(), "a task that must stop makes no picture");
+
+    // A photograph that was not fetched takes the PSNR alone.
+    let fetched = std::mem::take(&mut input.files);
+    let mut blind = Previews::of(&input, &config);
+    blind.due_now();
+    let pictures = blind.make(run.as_mut(), &|| true).unwrap();
+    assert!(pictures.len() == 2 && pictures.iter().all(|picture| picture.psnr_db.is_none()));
+    input.files = fetched;
 
     let off = TrainConfig { preview_seconds: 0, ..config };
     let mut none = Previews::of(&input, &off);
