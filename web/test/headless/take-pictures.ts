@@ -118,7 +118,7 @@ try {
     }
     await show(`jobs/${slope}/viewer`);
     await page.waitForFunction(() => document.querySelector<HTMLElement>('.viewer-host')?.fathomViewer !== undefined);
-    await take(page, 'viewer', page.locator('.viewer-host'), tabs);
+    await take(page, 'job-viewer', page.locator('.viewer-host'), tabs);
 
     await show(`jobs/${slope}/water`);
     await page.getByRole('heading', { name: 'Attenuation of direct light' }).waitFor();
