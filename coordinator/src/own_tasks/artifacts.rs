@@ -81,7 +81,7 @@ pub async fn assemble(objects: &Arc<BlobStore>, view: &JobView) -> Result<TaskOu
         ("plan.png".to_owned(), plan_png),
     ];
     files.push(("model.json".to_owned(), manifest_of(objects, &report.manifest, &model).await?));
-    if let Some(copy) = viewing_copy::make(objects, view, &model).await? {
+    if let Some(copy) = viewing_copy::make(objects, &model).await? {
         files.push((viewing_copy::FILE.to_owned(), copy));
     }
     for (path, value) in [

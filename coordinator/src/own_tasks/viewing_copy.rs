@@ -13,8 +13,6 @@ use tokio::sync::Semaphore;
 use super::OwnTaskError;
 use super::input::blocking;
 use crate::objects::BlobStore;
-use crate::schedule::{TaskId, TaskState};
-use crate::store::JobView;
 
 /// Its name among the files of a job.
 pub const FILE: &str = "model.compressed.ply";
@@ -27,21 +25,14 @@ const BLOCK: usize = 1 << 14;
 
 /// Stores the copy of a job's model. `None` where there is none: the model is too large, has nothing to show,
 /// or the disk is almost full.
-pub async fn make(
-    objects: &Arc<BlobStore>,
-    view: &JobView,
-    model: &BlobRef,
-) -> Result<Option<BlobRef>, OwnTaskError> {
-    let is_its = |state: &TaskState| matches!(state, TaskState::Done { result, .. } if result == model);
-    let made_by = view.tasks.iter().filter(|(task, _)| is_its(&task.state)).map(|(task, _)| task.task);
-    make_up_to(MOST_MODEL_BYTES, objects, model, made_by.collect()).await
+pub async fn make(objects: &Arc<BlobStore>, model: &BlobRef) -> Result<Option<BlobRef>, OwnTaskError> {
+    make_up_to(MOST_MODEL_BYTES, objects, model).await
 }
 
 async fn make_up_to(
     most_bytes: u64,
     objects: &Arc<BlobStore>,
     model: &BlobRef,
-    made_by: Vec<TaskId>,
 ) -> Result<Option<BlobRef>, OwnTaskError> {
     if model.bytes > most_bytes {
         let (bytes, most) = (model.bytes, most_bytes);
@@ -69,9 +60,16 @@ async fn make_up_to(
     });
     let (copy, is_damaged) = copy.await?;
     if is_damaged {
-        objects.set_aside_if_damaged(&model.digest).await?;
-        let message = format!("the model {} was damaged after it was stored", model.digest);
-        return Err(OwnTaskError::lost(made_by, message));
+        let digest = &model.digest;
+        // Only partitions can be made again, not what was merged of them.
+        return Err(if objects.set_aside_if_damaged(digest).await? {
+            OwnTaskError::input(format!(
+                "the model {digest} was damaged where it is stored after it was merged; check the disk or the \
+                 bucket, and submit the job again"
+            ))
+        } else {
+            OwnTaskError::failed(format!("the model {digest} was read with errors; its file is intact"))
+        });
     }
     let copy = match copy {
         Ok(Some(copy)) => copy,
@@ -132,9 +130,7 @@ mod tests {
 
     use super::*;
     use crate::clock::Clock;
-    use crate::schedule::Stage;
-
-    const MERGE: TaskId = TaskId { stage: Stage::Merge, part: None };
+    use crate::schedule::FailClass;
 
     async fn stored(model: &Gaussians) -> (TempDir, Arc<BlobStore>, BlobRef) {
         let folder = tempfile::tempdir().unwrap();
@@ -156,41 +152,37 @@ mod tests {
         model
     }
 
-    async fn made(objects: &Arc<BlobStore>, model: &BlobRef) -> Result<Option<BlobRef>, OwnTaskError> {
-        make_up_to(MOST_MODEL_BYTES, objects, model, vec![MERGE]).await
-    }
-
     #[tokio::test]
     async fn the_copy_has_all_gaussians_and_the_comments() {
         let (_folder, objects, blob) = stored(&model([1.0, 0.0, 0.0, 0.0])).await;
-        let copy = made(&objects, &blob).await.unwrap().unwrap();
+        let copy = make(&objects, &blob).await.unwrap().unwrap();
         let bytes = objects.read(&copy).await.unwrap();
         let header = String::from_utf8_lossy(&bytes[..1200.min(bytes.len())]).into_owned();
         assert!(header.contains("comment fathom_water {}\n"), "{header}");
         assert!(header.contains("element vertex 300\n"), "{header}");
         assert!(copy.bytes < blob.bytes / 2, "{} of {} bytes", copy.bytes, blob.bytes);
-        assert_eq!(made(&objects, &blob).await.unwrap(), Some(copy), "the same bytes again");
+        assert_eq!(make(&objects, &blob).await.unwrap(), Some(copy), "the same bytes again");
     }
 
     #[tokio::test]
     async fn a_model_without_a_copy_fails_no_job() {
         let (_folder, objects, blob) = stored(&model([1.0, 0.0, 0.0, 0.0])).await;
-        assert_eq!(make_up_to(blob.bytes - 1, &objects, &blob, Vec::new()).await.unwrap(), None, "too large");
+        assert_eq!(make_up_to(blob.bytes - 1, &objects, &blob).await.unwrap(), None, "too large");
         let (_folder, objects, blob) = stored(&model([0.0; 4])).await;
-        assert_eq!(made(&objects, &blob).await.unwrap(), None, "nothing to show");
+        assert_eq!(make(&objects, &blob).await.unwrap(), None, "nothing to show");
         let (_folder, objects, blob) = stored(&Gaussians::empty(0)).await;
-        assert_eq!(made(&objects, &blob).await.unwrap(), None, "no Gaussians");
+        assert_eq!(make(&objects, &blob).await.unwrap(), None, "no Gaussians");
     }
 
     #[tokio::test]
     async fn a_model_that_cannot_be_read_fails_the_task() {
         let (_folder, objects, blob) = stored(&model([1.0, 0.0, 0.0, 0.0])).await;
         let lost = BlobRef { digest: "0".repeat(64), ..blob };
-        assert!(made(&objects, &lost).await.is_err());
+        assert!(make(&objects, &lost).await.is_err());
     }
 
     #[tokio::test]
-    async fn a_damaged_model_is_made_again() {
+    async fn a_damaged_model_fails_the_job_with_a_remedy() {
         let (folder, objects, blob) = stored(&model([1.0, 0.0, 0.0, 0.0])).await;
         let path = objects.path_of(&blob).unwrap();
         let mut bytes = std::fs::read(&path).unwrap();
@@ -199,8 +191,9 @@ mod tests {
         bytes[at] ^= 1;
         std::fs::remove_file(&path).unwrap();
         std::fs::write(&path, bytes).unwrap();
-        let error = made(&objects, &blob).await.unwrap_err();
-        assert_eq!(error.lost, [MERGE], "{error}");
+        let error = make(&objects, &blob).await.unwrap_err();
+        assert_eq!((error.class, error.lost.len()), (FailClass::Input, 0), "{error}");
+        assert!(error.message.contains("submit the job again"), "{error}");
         assert!(!objects.contains(&blob).await.unwrap(), "the damaged file is set aside");
         drop(folder);
     }
