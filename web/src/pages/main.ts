@@ -236,8 +236,8 @@ function show(byUser: boolean): void {
 }
 
 /**
- * A link with nothing but a token or an invitation, such as that of `fathom train --web`, leads to the job if there is only
- * one. If there is none yet, the list of jobs waits for it.
+ * A link with nothing but a token or an invitation, such as that of `fathom train --web`, leads to the job if
+ * there is only one. If there is none yet, the list of jobs waits for it.
  */
 async function toOnlyJob(): Promise<void> {
     if (session.isBareLink && session.caller.jobId === '') {

@@ -38,7 +38,7 @@ export class PlanDetails {
             );
             return;
         }
-        const state = h('span', { class: 'fp-state', 'data-state': cell.state }, cell.state);
+        const state = stateOf(cell);
         const facts = factsOf(partition, cell).flatMap(([name, value]) => [h('dt', {}, name), h('dd', {}, value)]);
         this.#head.replaceChildren(
             h('h3', {}, `Partition ${partition.id} `, state),
@@ -135,6 +135,10 @@ export function summaryOf(plan: PlanContent, cameras: number): string {
     return `Seen from above: ${cut}, ${views}.${unknown}`;
 }
 
+/** The state of a cell; nothing before there is a job. */
+const stateOf = ({ state, task }: Pick<CellState, 'state' | 'task'>): Node | string =>
+    task === null ? '' : h('span', { class: 'fp-state', 'data-state': state }, state);
+
 /** The rows of the table of all partitions. */
 export function tableRows(
     plan: PlanContent | null,
@@ -150,7 +154,7 @@ export function tableRows(
                 { type: 'button', class: 'fp-link', onclick: () => choose(partition.id) },
                 String(partition.id),
             ),
-            h('span', { class: 'fp-state', 'data-state': state }, state),
+            stateOf({ state, task }),
             task?.worker ?? '',
             task ? `${grouped(task.iteration)} of ${grouped(task.iterations || partition.iterations)}` : '',
             String(task?.attempts ?? 0),

@@ -212,7 +212,11 @@ function drawWords(
     const ink = colour(`--${cell.state}`);
     const word = cell.isFirstPart && cell.state === 'running' ? 'first part' : cell.state;
     if (fits(ROOM_FOR_ALL)) {
-        const lines = [`${partition.id}`, cell.state === 'running' ? `${word} ${percent(cell.share)}` : word];
+        const lines = [`${partition.id}`];
+        // Before there is a job, a cell has no state.
+        if (cell.task !== null) {
+            lines.push(cell.state === 'running' ? `${word} ${percent(cell.share)}` : word);
+        }
         const worker = cell.task?.worker ?? null;
         const psnr = shownPsnr(cell.task);
         if (worker !== null && cell.state !== 'waiting') {
@@ -224,7 +228,8 @@ function drawWords(
         const shown = lines.map((line) => shorten(line, Math.floor(w / 8)));
         pill(context, shown, [left, top, right, bottom], cameras, ink, colour);
     } else if (fits(ROOM_FOR_STATE)) {
-        const lines = [`${partition.id}`, cell.state === 'running' ? percent(cell.share) : word];
+        const ofState = cell.state === 'running' ? percent(cell.share) : word;
+        const lines = cell.task === null ? [`${partition.id}`] : [`${partition.id}`, ofState];
         pill(context, lines, [left, top, right, bottom], cameras, ink, colour);
     } else if (fits(ROOM_FOR_NUMBER) && picture.plan.partitions.length <= 200) {
         drawSign(context, x + 7, y, 9, cell.state, ink);

@@ -221,7 +221,7 @@ class PlanMap implements Part<PlanMapData> {
         const words = shown.map((state) => `${counts[state]} ${state}`).join(', ');
         this.#canvas.setAttribute(
             'aria-label',
-            `Map of ${counted(plan.partitions.length, 'partition')}: ${words}. ${KEYS}`,
+            `Map of ${counted(plan.partitions.length, 'partition')}${data.tasks.length === 0 ? '' : `: ${words}`}. ${KEYS}`,
         );
         this.#showDetails();
         this.#table.refresh();
