@@ -49,7 +49,9 @@ async fn a_client_fetches_a_blob_from_the_bucket() {
     assert!(got(&url, 1000, blob.bytes - 1000).await == content[1000..]);
 
     let other = store.put(Bytes::from_static(b"of the same tenant")).await.unwrap();
-    let forged = url.replace(&blob.digest, &other.digest).replace(&blob.digest[..2], &other.digest[..2]);
+    let path_of = |digest: &str| format!("/{}/{digest}?", &digest[..2]);
+    let forged = url.replace(&path_of(&blob.digest), &path_of(&other.digest));
+    assert_ne!(forged, url, "only the path differs: a wrong date would be refused as malformed");
     let refused = Direct::default().get(&forged, 0, other.bytes).await.unwrap_err();
     assert!(matches!(refused, DirectError::Refused(status) if status == 403), "{refused}");
 
