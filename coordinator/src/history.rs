@@ -5,7 +5,7 @@
 //! ([`Logs::put_history`]), so that several coordinators can take turns on a task. If two write in the same
 //! moment, the news of one are lost, as are those that wait in a crash. No decision depends on a history.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashSet};
 use std::mem;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
@@ -148,6 +148,9 @@ fn is_readable(progress: &v1::Progress) -> bool {
     let held_out = progress.held_out.as_ref();
     let of_rgb = |of: &v1::Rgb| [of.red, of.green, of.blue];
     let water = progress.water.iter().flat_map(|water| [water.beta_d, water.beta_b, water.b_inf]);
+    let errors = progress.water.iter().filter_map(|water| water.standard_error);
+    let errors = errors.flat_map(|errors| [errors.beta_d, errors.beta_b, errors.b_inf]);
+    let mut errors = errors.flatten().flat_map(|of| [of.red, of.green, of.blue]).flatten();
     let spent = progress.time_spent.iter().flat_map(|spent| {
         [
             spent.seconds,
@@ -162,6 +165,7 @@ fn is_readable(progress: &v1::Progress) -> bool {
     progress.iterations_per_second.is_finite()
         && progress.loss.is_finite()
         && water.flatten().all(|of| of_rgb(&of).iter().all(|value| value.is_finite()))
+        && errors.all(|error| error.is_finite() && error >= 0.0)
         && spent.into_iter().all(f32::is_finite)
         && held_out.is_none_or(|held_out| held_out.psnr_db.is_finite() && held_out.ssim.is_finite())
 }
@@ -235,6 +239,19 @@ async fn stored(
         Some((task, v1::TaskHistory { task_id: task.to_string(), ..known }))
     };
     Ok(stored.into_iter().filter_map(history).collect())
+}
+
+/// The digests of all pictures that the history of a job names.
+///
+/// # Errors
+/// When the disk or the database fails.
+pub async fn pictures(shared: &State, job: &JobId) -> Result<HashSet<String>, LogError> {
+    // In this order: what is stored in between is there twice.
+    let waiting = shared.history.of_job(job);
+    let stored = stored(shared, job, None).await?;
+    let waiting = waiting.into_iter().flat_map(|(_, news)| news.previews);
+    let previews = waiting.chain(stored.into_values().flat_map(|history| history.previews));
+    Ok(previews.flat_map(|of| [of.render, of.clear]).flatten().map(|picture| picture.digest).collect())
 }
 
 /// The history of one task of a job, or of all, with what waits in this process. That of many tasks is

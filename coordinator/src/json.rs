@@ -7,7 +7,7 @@ use fathom_proto::admin::v1::{Caller, Role, Tenant, Token, Worker, WorkerState};
 use fathom_proto::v1::job_event::Event;
 use fathom_proto::v1::{
     Dataset, DatasetState, HeldOutMetrics, HistoryPoint, Inspection, Job, JobEvent, JobState, LogEntry,
-    LogSeverity, Preview, Rgb, Stage, Task, TaskHistory, TaskState, TimeSpent, WaterNow,
+    LogSeverity, Preview, Rgb, RgbErrors, Stage, Task, TaskHistory, TaskState, TimeSpent, WaterNow,
 };
 use prost_types::Timestamp;
 use serde_json::{Value, json};
@@ -185,7 +185,17 @@ pub fn task_history(of: &TaskHistory) -> Value {
 
 fn water(of: &WaterNow) -> Value {
     let rgb = |of: &Option<Rgb>| of.as_ref().map(|of| json!([of.red, of.green, of.blue]));
-    json!({ "beta_d": rgb(&of.beta_d), "beta_b": rgb(&of.beta_b), "b_inf": rgb(&of.b_inf) })
+    let each = |of: &Option<RgbErrors>| of.as_ref().map(|of| json!([of.red, of.green, of.blue]));
+    json!({
+        "beta_d": rgb(&of.beta_d),
+        "beta_b": rgb(&of.beta_b),
+        "b_inf": rgb(&of.b_inf),
+        "standard_error": of.standard_error.as_ref().map(|of| json!({
+            "beta_d": each(&of.beta_d),
+            "beta_b": each(&of.beta_b),
+            "b_inf": each(&of.b_inf),
+        })),
+    })
 }
 
 fn time_spent(of: &TimeSpent) -> Value {

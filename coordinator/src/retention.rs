@@ -11,6 +11,7 @@ use std::time::{Duration, SystemTime};
 use tracing::Instrument;
 
 use crate::datasets::DatasetId;
+use crate::history;
 use crate::logs::LogError;
 use crate::objects::{ObjectError, Removed};
 use crate::references::{Reference, reference_of, references};
@@ -209,6 +210,8 @@ async fn used(shared: &State) -> Result<HashMap<Tenant, HashSet<String>>, Retent
             };
             let tasks = view.tasks.iter().map(|(task, _)| task);
             used.add(&view.job.tenant, references(&view.job, tasks)).await?;
+            let of_tenant = used.by_tenant.entry(view.job.tenant.clone()).or_default();
+            of_tenant.extend(history::pictures(shared, &job.job_id).await?);
         }
     }
 }

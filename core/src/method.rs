@@ -12,7 +12,7 @@ use crate::gpu::Gpu;
 use crate::scene::{PinholeCamera, Pose};
 use crate::train::{HeldOutMetrics, Preview, Progress, TrainRun, Trainer};
 use crate::views::ViewSource;
-use crate::water::{Water, WaterRecord};
+use crate::water::{StandardErrors, Water, WaterRecord};
 
 pub use crate::config::Method;
 
@@ -78,6 +78,10 @@ pub trait Run {
     /// When the device fails.
     fn water(&self) -> Result<Option<Water>>;
 
+    /// One standard error of each parameter of that water, null where nothing determines it; `None` if the
+    /// run has no water.
+    fn water_errors(&self) -> Option<StandardErrors>;
+
     /// How long the run has waited for photographs that were not read yet.
     fn waited_for_photographs(&self) -> Duration;
 
@@ -133,6 +137,10 @@ impl Run for Trainer {
 
     fn water(&self) -> Result<Option<Water>> {
         self.water()
+    }
+
+    fn water_errors(&self) -> Option<StandardErrors> {
+        self.water_errors()
     }
 
     fn waited_for_photographs(&self) -> Duration {

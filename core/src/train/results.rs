@@ -5,7 +5,7 @@ use std::time::Duration;
 use super::{DeviceMedium, Exposures, Film, FilmEmbedding, MediumRun, MemoryUse, Predictor, Trainer};
 use crate::Result;
 use crate::gpu::{Blocks, Output, WaterView};
-use crate::water::{Water, WaterRecord};
+use crate::water::{StandardErrors, Water, WaterRecord};
 
 impl Trainer {
     /// The Gaussians on the device, trained and frozen.
@@ -38,6 +38,12 @@ impl Trainer {
     /// When the device fails.
     pub fn water(&self) -> Result<Option<Water>> {
         self.appearances.water().map(|medium| medium.water(&self.gpu, &self.frame)).transpose()
+    }
+
+    /// One standard error of each parameter of the current water, null where nothing determines it; `None` if
+    /// the run has no water.
+    pub fn water_errors(&self) -> Option<StandardErrors> {
+        self.appearances.water().map(DeviceMedium::standard_errors)
     }
 
     /// The record of the current water; `None` if the run has none.

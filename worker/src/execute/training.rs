@@ -16,7 +16,7 @@ use fathom_core::train::{
     surface_points, with_ray_maps,
 };
 use fathom_core::views::ViewSource;
-use fathom_core::water::{Water, WaterRecord};
+use fathom_core::water::{StandardErrors, Water, WaterRecord};
 use fathom_proto::v1::{self, Progress};
 use fathom_proto::worker::v1::CommonSpec;
 
@@ -243,7 +243,7 @@ pub fn advance(
             loss: progress.loss,
             iterations_per_second,
             held_out: history.last().copied(),
-            water: run.water()?.map(water_now),
+            water: run.water()?.map(|water| water_now(water, run.water_errors())),
             time_spent: Some(v1::TimeSpent {
                 training_seconds: training.saturating_sub(photographs).as_secs_f32(),
                 photographs_seconds: photographs.as_secs_f32(),
@@ -277,12 +277,25 @@ pub fn advance(
     Ok(history)
 }
 
-fn water_now(water: Water) -> v1::WaterNow {
+fn water_now(water: Water, errors: Option<StandardErrors>) -> v1::WaterNow {
     let rgb = |of: [f64; 3]| {
         let [red, green, blue] = of.map(|value| value as f32);
         Some(v1::Rgb { red, green, blue })
     };
-    v1::WaterNow { beta_d: rgb(water.beta_d), beta_b: rgb(water.beta_b), b_inf: rgb(water.b_inf) }
+    let each = |of: [Option<f64>; 3]| {
+        let [red, green, blue] = of.map(|error| error.map(|error| error as f32));
+        Some(v1::RgbErrors { red, green, blue })
+    };
+    v1::WaterNow {
+        beta_d: rgb(water.beta_d),
+        beta_b: rgb(water.beta_b),
+        b_inf: rgb(water.b_inf),
+        standard_error: errors.map(|errors| v1::WaterErrors {
+            beta_d: each(errors.beta_d),
+            beta_b: each(errors.beta_b),
+            b_inf: each(errors.b_inf),
+        }),
+    }
 }
 
 /// Iterations from `iteration` to the next measurement, one every `every`; 0: never.

@@ -184,9 +184,8 @@ impl DeviceMedium {
         let ends = run.network.is_some() && run.config.network.until >= run.config.freeze_at;
         let descends = run.is_free && run.config.descends() && !ends;
         let source = if descends { "descended" } else { run.source };
-        let errors = StandardErrors::from_array(run.standard_error.unwrap_or([f64::INFINITY; 9]));
-        let record =
-            WaterRecord::new(&self.water(gpu, frame)?, run.composition, errors, source, metres_per_unit);
+        let (water, errors) = (self.water(gpu, frame)?, self.standard_errors());
+        let record = WaterRecord::new(&water, run.composition, errors, source, metres_per_unit);
         let record = WaterRecord { shows_open_water: run.shows_open_water, ..record };
         Ok(record.with_refinement(self.refinement(gpu, frame)?).with_direction(run.by_direction))
     }
@@ -240,6 +239,11 @@ impl DeviceMedium {
         let water = Water::from_raw(raw.map(f64::from), self.run.unit);
         gpu.write(&self.state, SHARES_AT, &self.run.shares_of_rate(&water, Some(standard_error)));
         self.set_standard_error(standard_error);
+    }
+
+    /// The standard errors of the water parameters, null where nothing determines them.
+    pub fn standard_errors(&self) -> StandardErrors {
+        StandardErrors::from_array(self.run.standard_error.unwrap_or([f64::INFINITY; 9]))
     }
 
     /// Sets the standard errors of the water parameters.
