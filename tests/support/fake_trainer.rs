@@ -11,7 +11,7 @@ use fathom_core::water::{StandardErrors, Water, WaterRecord};
 use fathom_proto::v1;
 use fathom_proto::worker::v1 as worker_v1;
 use fathom_worker::blobs::to_proto;
-use fathom_worker::execute::{Control, Executor, Stop, TaskError, TaskInput, TaskOutput};
+use fathom_worker::execute::{Control, Executor, Picture, Stop, TaskError, TaskInput, TaskOutput};
 use glam::{DQuat, DVec3};
 use prost::Message as _;
 use serde_json::{Value, json};
@@ -135,6 +135,7 @@ impl FakeTrainer {
                 v1::Progress { iteration, iterations: total, gaussians: POINTS as u32, ..Default::default() };
             control.report(progress);
             if !submitted && iteration * 10 >= total && iteration < total {
+                control.preview(iteration, vec![picture(task, &state)]);
                 control.checkpoint(Bytes::copy_from_slice(&state), iteration);
                 submitted = true;
             }
@@ -305,6 +306,17 @@ fn comments(task: &TaskInput) -> Vec<String> {
         (None, WaterPartitions::Frozen) => return Vec::new(),
     };
     vec![water.to_comment().unwrap()]
+}
+
+/// A preview whose pictures are no others'.
+fn picture(task: &TaskInput, state: &[u8; 32]) -> Picture {
+    let bytes = |what: &[u8]| Bytes::from([what, state].concat());
+    Picture {
+        view: task.manifest.views[0].name.clone(),
+        render: bytes(b"a render"),
+        clear: Some(bytes(b"without the water")),
+        psnr_db: Some(20.0),
+    }
 }
 
 fn read_state(path: &Path) -> [u8; 32] {
