@@ -1,5 +1,9 @@
 //! Each verb with wrong input: a non-zero exit code, and a message with the fault, its place and a remedy.
 
+use std::path::Path;
+
+use serde_json::Value;
+
 use crate::processes::{fail, fathom, json, output_of, succeed, under};
 
 /// Nothing listens there: the port of a closed listener.
@@ -145,6 +149,29 @@ fn synth_refuses_sizes_and_folders_that_it_cannot_use() {
     crate::processes::tiny_scene(folder.path());
     let (_, said) = fail(&["synth", &out]);
     assert_says(&said, &[&out, "empty folder"]);
+}
+
+#[test]
+fn synth_makes_a_pool_and_refuses_flags_of_another_kind() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let out = under(folder.path(), "pool");
+    let (_, said) = fail(&["synth", &out, "--kind", "pool", "--look", "forward"]);
+    assert_says(&said, &["--look", "--kind wreck"]);
+    let (_, said) = fail(&["synth", &out, "--ior", "1.4"]);
+    assert_says(&said, &["--ior", "--kind pool"]);
+    let (_, said) = fail(&["synth", &out, "--kind", "pool", "--depth", "-1"]);
+    assert_says(&said, &["--depth is -1", "0.3 to 5"]);
+    assert!(!Path::new(&out).exists(), "a refused scene leaves nothing");
+    let pool = ["synth", &out, "--kind", "pool", "--views", "9", "--size", "64x48", "--depth", "1.2"];
+    let made = succeed(&[&pool[..], &["--ior", "1.4", "--json"]].concat());
+    let made: Value = serde_json::from_str(&made).expect("JSON");
+    assert_eq!((&made["views"], &made["truth_views"]), (&9.into(), &2.into()));
+    let surface = std::fs::read(under(folder.path(), "pool/truth/surface.json")).expect("the surface");
+    let surface: Value = serde_json::from_slice(&surface).expect("JSON");
+    assert_eq!((&surface["ior"], &surface["normal"]), (&1.4.into(), &serde_json::json!([0.0, -1.0, 0.0])));
+    // Every reader of scenes reads it.
+    let said = succeed(&["inspect", &out]);
+    assert_says(&said, &["9"]);
 }
 
 #[test]

@@ -3,11 +3,11 @@
 use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
-use fathom_core::synth::{SynthOptions, synthesise};
+use fathom_core::synth::{PoolOptions, SynthOptions, synthesise, synthesise_pool};
 use fathom_core::water::Water;
 
 use super::parse_size;
-use crate::error::Result;
+use crate::error::{CliError, Result};
 use crate::output;
 use crate::progress::{Progress, Unit};
 
@@ -17,13 +17,22 @@ pub struct SynthArgs {
     /// Folder to create, with images/, sparse/0 and truth/
     #[arg(value_name = "OUT")]
     out: PathBuf,
+    /// What is photographed: a `wreck` under water, or a `pool` from above, through its surface
+    #[arg(long, value_enum, default_value_t = Kind::Wreck)]
+    kind: Kind,
     /// Viewing direction: `down` onto a wreck, or `forward` along it over a reef that ends; open water above
-    /// the horizon is brighter upwards
-    #[arg(long, value_enum, default_value_t = Whereto::Down)]
-    look: Whereto,
-    /// Whether to add water between camera and wreck
-    #[arg(long, value_enum, default_value_t = Switch::On)]
-    water: Switch,
+    /// the horizon is brighter upwards [default: down]
+    #[arg(long, value_enum)]
+    look: Option<Whereto>,
+    /// Whether to add water between camera and wreck [default: on]
+    #[arg(long, value_enum)]
+    water: Option<Switch>,
+    /// Depth of a pool, metres [default: 0.8]
+    #[arg(long, value_name = "METRES")]
+    depth: Option<f64>,
+    /// Refractive index of the water of a pool [default: 1.333]
+    #[arg(long, value_name = "INDEX")]
+    ior: Option<f64>,
     /// Seed of textures, debris, camera path and noise
     #[arg(long, default_value_t = SynthOptions::default().seed)]
     seed: u32,
@@ -42,6 +51,12 @@ pub struct SynthArgs {
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+enum Kind {
+    Wreck,
+    Pool,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 enum Whereto {
     Down,
     Forward,
@@ -53,26 +68,67 @@ enum Switch {
     Off,
 }
 
+impl SynthArgs {
+    /// Refuses flags of another kind of scene.
+    fn check(&self) -> Result<()> {
+        let (given, of, needed) = match self.kind {
+            Kind::Wreck => {
+                ([("--depth", self.depth.is_some()), ("--ior", self.ior.is_some())], "a pool", "pool")
+            }
+            Kind::Pool => {
+                ([("--look", self.look.is_some()), ("--water", self.water.is_some())], "a wreck", "wreck")
+            }
+        };
+        match given.into_iter().find(|(_, is_given)| *is_given) {
+            Some((flag, _)) => {
+                Err(CliError::Message(format!("{flag} is for {of}; add --kind {needed}, or leave it out")))
+            }
+            None => Ok(()),
+        }
+    }
+
+    fn pool(&self) -> PoolOptions {
+        let usual = PoolOptions::default();
+        PoolOptions {
+            seed: self.seed,
+            views: self.views,
+            width: self.size.0,
+            height: self.size.1,
+            points_per_view: self.points_per_view,
+            depth: self.depth.unwrap_or(usual.depth),
+            ior: self.ior.unwrap_or(usual.ior),
+        }
+    }
+
+    fn wreck(&self) -> SynthOptions {
+        let of_look = match self.look {
+            None | Some(Whereto::Down) => SynthOptions::default(),
+            Some(Whereto::Forward) => SynthOptions::forward(),
+        };
+        let sized = SynthOptions {
+            seed: self.seed,
+            views: self.views,
+            width: self.size.0,
+            height: self.size.1,
+            points_per_view: self.points_per_view,
+            ..of_look
+        };
+        match self.water {
+            None | Some(Switch::On) => sized,
+            Some(Switch::Off) => SynthOptions { water: Water::CLEAR, by_direction: None, ..sized },
+        }
+    }
+}
+
 pub fn run(args: SynthArgs) -> Result<()> {
+    args.check()?;
     let (width, height) = args.size;
-    let of_look = match args.look {
-        Whereto::Down => SynthOptions::default(),
-        Whereto::Forward => SynthOptions::forward(),
-    };
-    let sized = SynthOptions {
-        seed: args.seed,
-        views: args.views,
-        width,
-        height,
-        points_per_view: args.points_per_view,
-        ..of_look
-    };
-    let options = match args.water {
-        Switch::On => sized,
-        Switch::Off => SynthOptions { water: Water::CLEAR, by_direction: None, ..sized },
-    };
     let progress = Progress::new("photographing", args.views.into(), Unit::Count("views"));
-    let summary = synthesise(&args.out, &options, |done, _| progress.set(done.into(), ""))?;
+    let show = |done: u32, _| progress.set(done.into(), "");
+    let summary = match args.kind {
+        Kind::Wreck => synthesise(&args.out, &args.wreck(), show)?,
+        Kind::Pool => synthesise_pool(&args.out, &args.pool(), show)?,
+    };
     progress.finish();
     if args.json {
         return output::json(&summary);

@@ -55,8 +55,7 @@ pub(super) fn write_colmap(
     cloud.u64(points.len() as u64);
     for (id, point) in (1_u64..).zip(points) {
         cloud.u64(id).f64s(&point.position.to_array()).u8s(&point.colour);
-        // The mean reprojection error that follows from the points' noise, pixels.
-        cloud.f64s(&[super::points::ERROR_PX]).u64(point.track.len() as u64);
+        cloud.f64s(&[point.error_px]).u64(point.track.len() as u64);
         for &(view, pixel) in &point.track {
             let observations = &mut seen[view as usize];
             cloud.u32(view + 1).u32(observations.len() as u32);

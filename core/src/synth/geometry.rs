@@ -23,6 +23,10 @@ pub(super) enum Material {
     Painted,
     /// Looks similar to open water.
     Dark,
+    /// Of a pool: tiles, striped walls, lamps that shine by themselves.
+    Tiles,
+    Stripes,
+    Lamp,
     /// Constant colour: pale paint, paint in the colour of water, raked sand.
     SmoothPale,
     SmoothBlue,

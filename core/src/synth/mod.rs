@@ -25,6 +25,8 @@
 //!   one, with J close to the colour of open water. 3 means that all meet one with constant J, and 1 anything
 //!   else.
 //!
+//! A pool seen through its surface ([`PoolOptions`]) has truth of its own.
+//!
 //! `truth/water.json` has `by_direction`, with the fields of [`ByDirection`], if the colour of open water
 //! changes. Distant sand has features finer than a pixel, which nine rays a pixel do not average out.
 
@@ -32,6 +34,7 @@ mod files;
 mod geometry;
 mod noise;
 mod points;
+mod pool;
 mod reef;
 mod survey;
 mod texture;
@@ -50,6 +53,7 @@ use crate::scene::{PinholeCamera, Pose};
 use crate::water::{ByDirection, Water};
 use crate::{CoreError, Result};
 use geometry::{Material, Ray, World};
+pub use pool::{OIL, PoolOptions, synthesise_pool};
 
 /// Every n-th view has ground truth: these are the views that training holds out by default.
 const TRUTH_EVERY: usize = 8;
@@ -152,23 +156,7 @@ impl SynthOptions {
     }
 
     fn validate(&self) -> Result<()> {
-        if !(2..=9999).contains(&self.views) {
-            return Err(CoreError::Config(format!("--views is {}; it must be 2 to 9999", self.views)));
-        }
-        if !(16..=8192).contains(&self.width) || !(16..=8192).contains(&self.height) {
-            let (width, height) = (self.width, self.height);
-            return Err(CoreError::Config(format!(
-                "--size is {width}x{height}; each side must be 16 to 8192"
-            )));
-        }
-        let most = u32::MAX / self.views;
-        if !(1..=100_000).contains(&self.points_per_view) || self.points_per_view > most {
-            return Err(CoreError::Config(format!(
-                "--points-per-view is {}; it must be 1 to {}",
-                self.points_per_view,
-                most.min(100_000)
-            )));
-        }
+        validate_sizes(self.views, self.width, self.height, self.points_per_view)?;
         if !self.water.is_physical() {
             return Err(CoreError::Config(format!(
                 "the water must have finite numbers, none below 0, and colours of at most 1; it is {:?}",
@@ -182,6 +170,41 @@ impl SynthOptions {
         }
         Ok(())
     }
+}
+
+/// Refuses numbers that no kind of scene allows.
+fn validate_sizes(views: u32, width: u32, height: u32, points_per_view: u32) -> Result<()> {
+    if !(2..=9999).contains(&views) {
+        return Err(CoreError::Config(format!("--views is {views}; it must be 2 to 9999")));
+    }
+    if !(16..=8192).contains(&width) || !(16..=8192).contains(&height) {
+        return Err(CoreError::Config(format!("--size is {width}x{height}; each side must be 16 to 8192")));
+    }
+    let most = u32::MAX / views;
+    if !(1..=100_000).contains(&points_per_view) || points_per_view > most {
+        return Err(CoreError::Config(format!(
+            "--points-per-view is {points_per_view}; it must be 1 to {}",
+            most.min(100_000)
+        )));
+    }
+    Ok(())
+}
+
+/// Makes the folders of a scene in `out`, which must not hold one.
+fn new_folders(out: &Path, maps: impl Iterator<Item = String>) -> Result<()> {
+    for folder in ["images", "sparse"] {
+        if out.join(folder).exists() {
+            return Err(CoreError::input(
+                out,
+                format!("holds {folder}/ already; give an empty folder, or remove that one first"),
+            ));
+        }
+    }
+    for folder in ["images", "sparse/0"].map(str::to_owned).into_iter().chain(maps) {
+        let folder = out.join(folder);
+        std::fs::create_dir_all(&folder).map_err(CoreError::io("create", &folder))?;
+    }
+    Ok(())
 }
 
 /// Counts of the generated scene.
@@ -205,22 +228,11 @@ pub fn synthesise(
     progress: impl Fn(u32, u32) + Sync,
 ) -> Result<SynthSummary> {
     options.validate()?;
-    for folder in ["images", "sparse"] {
-        if out.join(folder).exists() {
-            return Err(CoreError::input(
-                out,
-                format!("holds {folder}/ already; give an empty folder, or remove that one first"),
-            ));
-        }
-    }
     let maps: &[&str] = match options.look {
         Look::Down => &["truth/clear", "truth/valid"],
         Look::Forward => &["truth/clear", "truth/valid", "truth/alpha", "truth/kind"],
     };
-    for folder in ["images", "sparse/0"].iter().chain(maps) {
-        let folder = out.join(folder);
-        std::fs::create_dir_all(&folder).map_err(CoreError::io("create", &folder))?;
-    }
+    new_folders(out, maps.iter().map(|&map| map.to_owned()))?;
 
     let world = options.look.world(options.seed);
     let camera = survey::camera(options.width, options.height);

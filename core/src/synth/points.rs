@@ -16,6 +16,8 @@ pub(super) const ERROR_PX: f64 = 0.3;
 pub(super) struct SparsePoint {
     pub position: DVec3,
     pub colour: [u8; 3],
+    /// Mean reprojection error, pixels.
+    pub error_px: f64,
     /// View index, pixel.
     pub track: Vec<(u32, [f64; 2])>,
 }
@@ -62,13 +64,14 @@ pub(super) fn sparse_points(
             let colour = sum.map(|s| ((s as f64 / track.len() as f64).round()) as u8);
             let spread = ERROR_PX * hit.range / camera.fx;
             let error = super::normal_numbers(seed, 30_000 + view, candidate % points_per_view);
-            Some(SparsePoint { position: surface + error * spread, colour, track })
+            // The mean reprojection error that follows from the points' noise.
+            Some(SparsePoint { position: surface + error * spread, colour, error_px: ERROR_PX, track })
         })
         .collect()
 }
 
 /// Pixel of a world point, if it is in the picture and at least two pixels from its rim.
-fn project(camera: &PinholeCamera, pose: &Pose, point: DVec3) -> Option<[f64; 2]> {
+pub(super) fn project(camera: &PinholeCamera, pose: &Pose, point: DVec3) -> Option<[f64; 2]> {
     let p = pose.transform(point);
     if p.z < 0.1 {
         return None;

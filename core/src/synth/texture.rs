@@ -39,7 +39,8 @@ pub(super) fn radiance(world: &World, ray: &Ray, hit: &Hit, seed: u32) -> DVec3 
     albedo(hit, seed) * (ambient + direct)
 }
 
-fn albedo(hit: &Hit, seed: u32) -> DVec3 {
+/// Reflectance of a hit, linear light.
+pub(super) fn albedo(hit: &Hit, seed: u32) -> DVec3 {
     let p = hit.local;
     // Each part has its own shift, so that two barrels look different.
     let own = p + DVec3::splat(f64::from(hit.seed % 1021) * 3.7);
@@ -50,8 +51,11 @@ fn albedo(hit: &Hit, seed: u32) -> DVec3 {
         Material::Timber => timber(own, hit.seed),
         Material::Planks => planks(own, p, hit.seed),
         Material::Painted => painted(own, hit.seed),
+        Material::Tiles => tiles(hit, hit.seed),
+        Material::Stripes => stripes(hit, hit.seed),
         // `radiance` does not use the albedo of these.
         Material::Dark => DARK,
+        Material::Lamp => DVec3::ONE,
         Material::SmoothPale => SMOOTH_PALE,
         Material::SmoothBlue => SMOOTH_BLUE,
         Material::SmoothSand => SMOOTH_SAND,
@@ -151,4 +155,34 @@ fn painted(own: DVec3, seed: u32) -> DVec3 {
     let bare = ramp(0.48, 0.60, fractal(own * 2.8, 4, seed ^ 0x91));
     let grain = fractal(own * 6.0, 3, seed ^ 0x92);
     paint.lerp(DVec3::new(0.30, 0.12, 0.05), bare) * (0.5 + grain)
+}
+
+/// Tiles of different glazes with pale joints; some have a pattern.
+fn tiles(hit: &Hit, seed: u32) -> DVec3 {
+    const SIDE: f64 = 0.125;
+    let p = hit.local / SIDE;
+    let cell = p.floor();
+    let within = p - cell - DVec3::splat(0.5);
+    // Of the two axes along the face.
+    let rim =
+        DVec3::select(hit.normal.abs().cmplt(DVec3::splat(0.5)), within.abs(), DVec3::ZERO).max_element();
+    if rim > 0.46 {
+        return DVec3::new(0.55, 0.54, 0.50);
+    }
+    // The layer of a face does not depend on rounding.
+    let cell = DVec3::select(hit.normal.abs().cmplt(DVec3::splat(0.5)), cell, hit.normal.signum());
+    let at = |k: i32| lattice(cell.x as i32 + 13 * k, cell.y as i32, cell.z as i32, seed);
+    let glaze = DVec3::new(0.10, 0.32, 0.42).lerp(DVec3::new(0.46, 0.52, 0.47), at(0));
+    let marbled = 0.55 + 0.9 * fractal(hit.local * 9.0 + at(1) * 7.0, 3, seed ^ 0xB1);
+    let is_dotted = at(2) > 0.72 && within.length() < 0.28;
+    if is_dotted { DVec3::new(0.50, 0.20, 0.10) * marbled } else { glaze * marbled }
+}
+
+/// Slanted stripes of different colours.
+fn stripes(hit: &Hit, seed: u32) -> DVec3 {
+    let along = (hit.local.x + 0.6 * hit.local.y + hit.local.z) / 0.45;
+    let at = |k: i32| lattice(along.floor() as i32, k, 0, seed);
+    let tone = 0.08 + 0.62 * at(0);
+    let rough = 0.7 + 0.6 * fractal(hit.local * 1.7, 3, seed ^ 0xC1);
+    DVec3::new(tone * (0.7 + 0.5 * at(1)), tone * (0.7 + 0.4 * at(2)), tone * (0.6 + 0.5 * at(3))) * rough
 }
