@@ -11,10 +11,18 @@ import { pathToFileURL } from 'node:url';
 import type { Browser, Page } from 'playwright-core';
 
 import type { CameraEntry, Mode } from '../../src/viewer/index.ts';
-import { SMALL_WINDOW, WINDOW, launch, newPage } from './browser.ts';
+import {
+    SMALL_WINDOW,
+    VIEWER_WINDOW,
+    WIDE_WINDOW,
+    launch,
+    newPage,
+    shrinkViewer,
+    unshrinkViewer,
+} from './browser.ts';
 import { type Picture, decodePng, psnr, readPng } from './pictures.ts';
 import { serve } from './server.ts';
-import { accessible, fitsWindow } from './steps.ts';
+import { accessible, accessibleInDark, fitsWindow } from './steps.ts';
 
 const WEB = join(import.meta.dirname, '../..');
 const DATA = process.env['VIEWER_DATA'] ?? join(WEB, 'test-data');
@@ -56,6 +64,7 @@ async function picture(page: Page, camera: CameraEntry, mode: Mode): Promise<Pic
 
 /** Compares every other camera with `fathom render` of the full model. */
 async function compare(page: Page, what: string, goal: number): Promise<void> {
+    await shrinkViewer(page);
     for (const mode of ['clear', 'water'] as const) {
         const values: number[] = [];
         for (const camera of cameras().filter((_, i) => i % 2 === 0)) {
@@ -69,9 +78,12 @@ async function compare(page: Page, what: string, goal: number): Promise<void> {
     }
 }
 
+const settled = (page: Page): Promise<void> =>
+    page.evaluate(() => document.querySelector<HTMLElement>('#viewer')!.fathomViewer!.settled());
+
 async function screen(page: Page): Promise<Picture> {
-    await page.evaluate(() => document.querySelector<HTMLElement>('#viewer')!.fathomViewer!.settled());
-    return decodePng(await page.locator('.fv-canvas').screenshot());
+    await settled(page);
+    return decodePng(await page.locator('.fv-canvas').screenshot(TIMEOUT));
 }
 
 test('a compressed copy shows what the model shows, with the water in its header', TIMEOUT, async () => {
@@ -101,7 +113,8 @@ test('the page opens from the disk without a network and shows the model', TIMEO
     await page.goto(address);
     await waitForViewer(page);
     await compare(page, 'page', GOAL);
-    await page.setViewportSize(WINDOW);
+    await unshrinkViewer(page);
+    await page.setViewportSize(VIEWER_WINDOW);
 
     // Nothing that was put in is markup.
     assert.equal(await page.title(), '<script>wreck & co - Fathom');
@@ -136,7 +149,7 @@ test('the page opens from the disk without a network and shows the model', TIMEO
 });
 
 test('the page begins with the view of a link and offers the views kept in it', TIMEOUT, async () => {
-    const { page, complaints } = await newPage(browser);
+    const { page, complaints } = await newPage(browser, { viewport: VIEWER_WINDOW });
     await page.goto(pathToFileURL(join(DATA, 'handover/views.html')).href);
     await waitForViewer(page);
     assert.ok(await page.getByRole('radio', { name: 'Without water' }).isChecked());
@@ -150,20 +163,22 @@ test('the page begins with the view of a link and offers the views kept in it', 
 });
 
 test('nothing is wrong with the page for people who cannot see or point, in light and dark', TIMEOUT, async () => {
-    const { page, complaints } = await newPage(browser);
+    const { page, complaints } = await newPage(browser, { viewport: VIEWER_WINDOW });
     await page.goto(pathToFileURL(PAGE).href);
     await waitForViewer(page);
     await page.getByRole('button', { name: 'Compare with the photograph' }).scrollIntoViewIfNeeded();
     await page.getByRole('button', { name: 'View 2', exact: true }).click();
     await page.getByLabel('Compare with', { exact: true }).selectOption('photograph');
     await page.getByText('Mouse, touch and keys').click();
-    for (const colorScheme of ['light', 'dark'] as const) {
-        for (const [size, viewport] of Object.entries({ wide: WINDOW, phone: { width: 360, height: 640 } })) {
+    const sizes = { wide: WIDE_WINDOW, phone: { width: 360, height: 640 } };
+    for (const [size, viewport] of Object.entries(sizes)) {
+        await page.setViewportSize(viewport);
+        for (const colorScheme of ['light', 'dark'] as const) {
             await page.emulateMedia({ colorScheme });
-            await page.setViewportSize(viewport);
-            await screen(page);
-            await accessible(page, `the page, ${size}, ${colorScheme}`);
-            await fitsWindow(page, `the page, ${size}, ${colorScheme}`);
+            await settled(page);
+            const what = `the page, ${size}, ${colorScheme}`;
+            await (colorScheme === 'light' ? accessible(page, what) : accessibleInDark(page, what));
+            await fitsWindow(page, what);
         }
     }
     assert.deepEqual(complaints, []);

@@ -19,6 +19,8 @@ import { serveWith } from './service.ts';
 /** What the service tells of its job. Tests change it while a page is open. */
 export interface Told {
     job: MessageInitShape<typeof JobSchema>;
+    /** The list of jobs, where it is not that job alone. */
+    jobs?: MessageInitShape<typeof JobSchema>[];
     history: MessageInitShape<typeof HistorySchema>;
     events: MessageInitShape<typeof JobEventSchema>[];
     /** By digest. */
@@ -43,6 +45,10 @@ export interface MadeUp {
     readonly read: string[];
     /** Paths of the files that were asked for, in order. */
     readonly asked: string[];
+    /** Names of the calls, in order. */
+    readonly calls: string[];
+    /** How many streams of events are open. */
+    streams(): number;
     close(): void;
 }
 
@@ -77,12 +83,14 @@ export async function serveMadeUp(dist: string): Promise<MadeUp> {
     };
     const read: string[] = [];
     const askedFor: string[] = [];
+    const calls: string[] = [];
+    let streams = 0;
     const answers: Readonly<Record<string, (asked: Buffer) => readonly Buffer[] | null>> = {
         GetCaller: () => [
             framed(CallerSchema, { name: 'ada', role: told.role ?? Role.VIEWER, tokensRequired: true }),
         ],
         ListWorkers: () => [framed(ListWorkersResponseSchema, { workers: told.workers ?? [] })],
-        ListJobs: () => [framed(ListJobsResponseSchema, { jobs: [told.job] })],
+        ListJobs: () => [framed(ListJobsResponseSchema, { jobs: told.jobs ?? [told.job] })],
         GetJob: () => [framed(JobSchema, told.job)],
         GetHistory: () => [framed(HistorySchema, told.history)],
         WatchJob: () => told.events.map((event) => framed(JobEventSchema, event)),
@@ -123,6 +131,7 @@ export async function serveMadeUp(dist: string): Promise<MadeUp> {
             return;
         }
         const method = pathname.split('/').at(-1) ?? '';
+        calls.push(method);
         const pieces: Buffer[] = [];
         asked.on('data', (piece: Buffer) => pieces.push(piece));
         asked.on('end', () => {
@@ -135,8 +144,11 @@ export async function serveMadeUp(dist: string): Promise<MadeUp> {
             response.write(Buffer.concat(answer ?? []));
             if (answer === null) {
                 response.end(trailer(NOT_FOUND));
-            } else if (method !== 'WatchJob') {
+            } else if (method === 'WatchJob') {
                 // A stream of events stays open.
+                streams += 1;
+                response.on('close', () => (streams -= 1));
+            } else {
                 response.end(trailer(0));
             }
         });
@@ -148,6 +160,8 @@ export async function serveMadeUp(dist: string): Promise<MadeUp> {
         told,
         read,
         asked: askedFor,
+        calls,
+        streams: () => streams,
         close: () => {
             serving.close();
             service.closeAllConnections();

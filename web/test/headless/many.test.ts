@@ -25,7 +25,7 @@ import { ReadBlobResponseSchema, UploadService } from '../../src/rpc/fathom/v1/u
 import { launch, newPage } from './browser.ts';
 import { TRAILER, framed, messageOf } from './grpc-web.ts';
 import { Service, serveWith } from './service.ts';
-import { openAs } from './steps.ts';
+import { askAgain, openAs } from './steps.ts';
 
 const PAGES = process.env['PAGES'] ?? join(import.meta.dirname, '../../dist');
 const FATHOM = process.env['FATHOM'] ?? '';
@@ -40,6 +40,8 @@ const NOW = Date.now();
 const TIMEOUT = { timeout: 60_000 };
 const FIRST_PAINT_MS = 1000;
 const STEP_MS = 200;
+/** A page has asked again, and has drawn what it was told. */
+const ROUND_MS = 1500;
 /** The quickest of so many counts, since other programs may use the processor too. */
 const TRIES = 4;
 
@@ -178,8 +180,8 @@ async function quickest(limit: number, measure: () => Promise<number>): Promise<
     return least;
 }
 
-/** The longest time, in ms, for which the page was busy at a stretch while `ms` passed; 0 if below 50. */
-const longestTask = (page: Page, ms: number): Promise<number> =>
+/** The longest time, in ms, for which the page was busy at a stretch in a round of its poll; 0 if below 50. */
+const longestTask = (page: Page): Promise<number> =>
     page.evaluate(async (waited) => {
         let longest = 0;
         const observer = new PerformanceObserver((list) => {
@@ -188,10 +190,12 @@ const longestTask = (page: Page, ms: number): Promise<number> =>
             }
         });
         observer.observe({ type: 'longtask' });
+        // As `askAgain`.
+        setTimeout(() => document.dispatchEvent(new Event('visibilitychange')), 0);
         await new Promise((done) => setTimeout(done, waited));
         observer.disconnect();
         return longest;
-    }, ms);
+    }, ROUND_MS);
 
 test('a list of 500 jobs is there at once', TIMEOUT, async (t) => {
     const shownMs = await quickest(FIRST_PAINT_MS, async () => {
@@ -219,7 +223,8 @@ test('a long list has pictures of the jobs in sight only, and each once', TIMEOU
         }, name);
     await picture('Transect 0');
     // A round of the poll, in which nobody may ask again.
-    await page.waitForTimeout(4000);
+    await askAgain(page);
+    await page.waitForTimeout(ROUND_MS);
     const inSight = historiesAsked.length;
     assert.ok(inSight > 0 && inSight < 20, `${inSight} of 50`);
     await page.getByRole('row', { name: 'Transect 49' }).scrollIntoViewIfNeeded();
@@ -251,8 +256,7 @@ test('200 workers are kept up to date quickly', TIMEOUT, async (t) => {
     await page.goto(`${serving.address}/#/service`);
     await page.getByRole('row', { name: 'gpu-199' }).waitFor();
     await page.getByText(`${WORKERS} workers, ${WORKERS} at work`).waitFor();
-    // At least one round of the poll each.
-    const longest = await quickest(STEP_MS, () => longestTask(page, 4000));
+    const longest = await quickest(STEP_MS, () => longestTask(page));
     t.diagnostic(`longest task ${longest.toFixed(0)} ms`);
     assert.ok(longest < STEP_MS, `${longest} ms`);
     assert.deepEqual(complaints, []);
@@ -305,7 +309,7 @@ test('a job of 1000 partitions stays quick', TIMEOUT, async (t) => {
     await page.getByRole('heading', { name: 'Stages' }).waitFor();
     await page.getByText('2 h 1 min left').waitFor();
     await page.waitForTimeout(1000);
-    const longest = await quickest(STEP_MS, () => longestTask(page, 4000));
+    const longest = await quickest(STEP_MS, () => longestTask(page));
     t.diagnostic(`longest task ${longest.toFixed(0)} ms`);
     assert.ok(longest < STEP_MS, `${longest} ms`);
     assert.deepEqual(complaints, []);

@@ -11,7 +11,7 @@ import { join } from 'node:path';
 import { after, before, test } from 'node:test';
 import type { Browser, Page } from 'playwright-core';
 
-import { launch, newPage } from './browser.ts';
+import { VIEWER_WINDOW, WIDE_WINDOW, launch, newPage } from './browser.ts';
 import { POLICY } from './server.ts';
 import { type JobJson, Service } from './service.ts';
 import { finish, openAs, until } from './steps.ts';
@@ -83,7 +83,7 @@ after(async () => {
 test('the page that a coordinator serves shows its jobs, their views, logs and models', { skip, ...TIMEOUT }, async () => {
     const address = `http://127.0.0.1:${service.webPort}/`;
     await keepsPolicy(address);
-    const opened = await openAs(browser, `${address}#/jobs`, ana);
+    const opened = await openAs(browser, `${address}#/jobs`, ana, { viewport: WIDE_WINDOW });
     const { page } = opened;
     await page.getByRole('row', { name: 'Embedded' }).getByRole('link').click();
     const shown = page.locator('.job-head .chip');
@@ -111,7 +111,7 @@ test('the page of fathom view shows the model', { skip, ...TIMEOUT }, async () =
     const viewing = run('view', result, '--photographs', data);
     const address = await addressOf(viewing, /is at (http:\/\/\S+)/);
     await keepsPolicy(address);
-    const opened = await newPage(browser);
+    const opened = await newPage(browser, { viewport: VIEWER_WINDOW });
     await opened.page.goto(address);
     assert.equal(await gaussiansOf(opened.page, '#viewer'), Number(vertices));
     await opened.page.getByRole('button', { name: 'Next photograph' }).click();

@@ -12,7 +12,7 @@ import { after, before, test } from 'node:test';
 import type { Browser, BrowserContextOptions, Locator, Page } from 'playwright-core';
 
 import { brief } from '../../src/pages/parts/format.ts';
-import { launch, newPage } from './browser.ts';
+import { WIDE_WINDOW, launch, newPage } from './browser.ts';
 import { type Picture, psnr } from './pictures.ts';
 import { type JobJson, Service, serveWith } from './service.ts';
 import { type Opened, accessible, finish as finishAll, fitsWindow, openAs, sleep, until } from './steps.ts';
@@ -348,6 +348,8 @@ test('the sections of a job show its log, files, settings and pictures', { skip,
     await page.locator('.fp-curves canvas').first().waitFor();
     await accessible(page, 'the curves');
 
+    // Without a graphics card the viewer draws slowly.
+    await page.setViewportSize(WIDE_WINDOW);
     await section('Viewer');
     const gaussians = await page
         .waitForFunction(() => document.querySelector<HTMLElement>('.viewer-host')?.fathomViewer?.gaussians, null, TIMEOUT)

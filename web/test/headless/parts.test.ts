@@ -9,10 +9,13 @@ import { timestampFromMs } from '@bufbuild/protobuf/wkt';
 import type { Browser, Page } from 'playwright-core';
 import { PNG } from 'pngjs';
 
+import { MOST_JOBS } from '../../src/pages/service/bounds-of-jobs.ts';
+import { brief } from '../../src/pages/parts/format.ts';
+import { Role } from '../../src/rpc/fathom/admin/v1/admin_pb.ts';
 import { JobState, Stage, TaskState } from '../../src/rpc/fathom/v1/job_pb.ts';
-import { launch } from './browser.ts';
+import { WIDE_WINDOW, launch } from './browser.ts';
 import { type MadeUp, json, serveMadeUp } from './made-up.ts';
-import { type Opened, finish, looksRight, openAs } from './steps.ts';
+import { type Opened, askAgain, finish, looksRight, openAs } from './steps.ts';
 
 const PAGES = process.env['PAGES'] ?? join(import.meta.dirname, '../../dist');
 const TIMEOUT = { timeout: 60_000 };
@@ -43,7 +46,10 @@ const JOB = {
     createTime: timestampFromMs(NOW - 600_000),
 };
 
-const open = (section: string): Promise<Opened> => openAs(browser, `${service.address}/#/jobs/7${section}`);
+const open = (section: string, options = {}): Promise<Opened> =>
+    openAs(browser, `${service.address}/#/jobs/7${section}`, '', options);
+/** The viewer in a small window: without a graphics card it draws slowly. */
+const openViewer = (): Promise<Opened> => open('/viewer', { viewport: WIDE_WINDOW });
 
 const rgb = (red: number, green: number, blue: number) => ({ red, green, blue });
 
@@ -57,13 +63,31 @@ const waterAt = (index: number, share: number) => {
     };
 };
 
-const settling = (points: number) =>
-    Array.from({ length: 4 }, (_, index) => ({
+/** Standard errors that shrink; nothing determines the backscatter of red, nor open water. */
+const errorsAt = (share: number) => {
+    const of = (end: number): number => end * (1 + 3 * Math.exp(-4 * share));
+    return {
+        betaD: { red: of(0.012), green: of(0.006), blue: of(0.004) },
+        betaB: { green: of(0.02), blue: of(0.01) },
+    };
+};
+
+/** The water of tasks that settles, with errors unless workers are too old to report them. */
+const settling = (points: number, hasErrors = false, tasks = 4) =>
+    Array.from({ length: tasks }, (_, index) => ({
         taskId: `first_part-000${index}`,
         points: Array.from({ length: points }, (__, at) => ({
             time: timestampFromMs(NOW - 300_000 + at * 5000),
             attempt: 1,
-            progress: { iteration: at * 100, iterations: 6000, loss: 0.1, water: waterAt(index, at / 40) },
+            progress: {
+                iteration: at * 100,
+                iterations: 6000,
+                loss: 0.1,
+                water: {
+                    ...waterAt(index, at / 40),
+                    ...(hasErrors ? { standardError: errorsAt(at / 40) } : {}),
+                },
+            },
         })),
     }));
 
@@ -83,6 +107,7 @@ test('the water is shown while it settles, with the spread between partitions', 
     const { page } = opened;
     await page.getByText('The water is shown here while it trains').waitFor();
     service.told.history = { tasks: settling(20) };
+    await askAgain(page);
     await page.getByText('First part of partition 0 at iteration 1,900').waitFor();
     assert.equal(await page.locator('.fp-curve canvas').count(), 3);
     const expected = waterAt(0, 19 / 40).betaD.red.toPrecision(3);
@@ -99,11 +124,73 @@ test('the water is shown while it settles, with the spread between partitions', 
     // The values of partition 3 are 15 % above those of partition 0, of a mean of 1.075 times the latter.
     assert.equal(await page.locator('.fp-water-spread').getByText('14 % apart').count(), 9);
     await page.getByLabel('Water of').selectOption('First part of partition 2');
-    service.told.history = { tasks: settling(40) };
+    assert.equal(await page.locator('.fp-water-parameter').count(), 0, 'these workers report no errors');
+    service.told.history = { tasks: settling(40, true) };
+    await askAgain(page);
     await page.getByText('First part of partition 2 at iteration 3,900').waitFor();
+    // Bands between partitions stay; the tables have the errors of the chosen task.
+    await page.getByText('Bands: lowest to highest of 4 tasks of this stage, dashed: their mean.').waitFor();
+    assert.deepEqual(await numbersOf(page), expectedNumbers(2, 39 / 40));
+    assert.equal(await page.locator('.fp-water-error').count(), 5, 'a bar for each error');
+    await page.getByText('one standard error, drawn on the bars. –: the photographs').waitFor();
     await page.getByText('The latest water of each task as a table').click();
-    await page.getByRole('row', { name: 'First part of partition 3' }).waitFor();
+    const row = page.getByRole('row', { name: 'First part of partition 3' });
+    const { betaD } = waterAt(3, 39 / 40);
+    const ofRed = `${brief(betaD.red)} ±\u00a0${brief(errorsAt(39 / 40).betaD.red, 2)}`;
+    assert.equal((await row.getByRole('cell').allTextContents())[1], ofRed);
     await looksRight(opened, 'water');
+    await finish(opened);
+});
+
+/** The tables of the page: by parameter and colour, its value and its error. */
+const numbersOf = (page: Page): Promise<(string | null)[][]> =>
+    page
+        .locator('.fp-water-parameter tbody tr')
+        .evaluateAll((rows) =>
+            rows.map((row) => [...row.children].slice(0, 3).map(({ textContent }) => textContent)),
+        );
+
+/** What the tables say of the history that `settling` makes. */
+const expectedNumbers = (index: number, share: number): string[][] => {
+    const errors: Record<string, Record<string, number>> = errorsAt(share);
+    return Object.entries(waterAt(index, share)).flatMap(([parameter, values]) =>
+        Object.entries(values).map(([channel, value]) => {
+            const error = errors[parameter]?.[channel];
+            const name = `${channel[0]!.toUpperCase()}${channel.slice(1)}`;
+            return [name, brief(value), error === undefined ? '–' : brief(error, 2)];
+        }),
+    );
+};
+
+test('bands show the errors of the water of one task', TIMEOUT, async () => {
+    service.told.job = { ...JOB, tasks: firstParts.slice(0, 1) };
+    service.told.history = { tasks: settling(30, true, 1) };
+    const opened = await open('/water');
+    const { page } = opened;
+    await page.getByText('Lines are red, green and blue light. Bands: ± one standard error.').waitFor();
+    assert.deepEqual(await numbersOf(page), expectedNumbers(0, 29 / 40));
+    await looksRight(opened, 'water-errors');
+    const coloured = (): Promise<number> =>
+        page
+            .locator('.fp-curve canvas')
+            .first()
+            .evaluate((canvas: HTMLCanvasElement) => {
+                const context = canvas.getContext('2d')!;
+                const { data } = context.getImageData(0, 0, canvas.width, canvas.height);
+                let count = 0;
+                for (let at = 0; at < data.length; at += 4) {
+                    // The opacity of a band is 0x2e; where two overlap it is more.
+                    count += data[at + 3]! > 40 && data[at + 3]! < 90 ? 1 : 0;
+                }
+                return count;
+            });
+    const withErrors = await coloured();
+    service.told.history = { tasks: settling(31, false, 1) };
+    await page.getByText('at iteration 3,000. Lines are red, green and blue light.').waitFor();
+    assert.equal(await page.getByText('Bands:').count(), 0);
+    await page.locator('.fp-water-parameter').waitFor({ state: 'detached' });
+    const without = await coloured();
+    assert.ok(withErrors > without + 1000, `${withErrors} pixels of bands, ${without} without errors`);
     await finish(opened);
 });
 
@@ -148,10 +235,10 @@ test('a job in air says that it has no water', TIMEOUT, async () => {
     await finish(opened);
 });
 
-const changed = (secondsAgo: number, seq: number, taskId: string, stage: Stage, state: TaskState) => ({
+const changed = (at: number, seq: number, taskId: string, stage: Stage, state: TaskState) => ({
     jobId: '7',
     seq: BigInt(seq),
-    time: timestampFromMs(NOW - 1000 * secondsAgo),
+    time: timestampFromMs(at),
     event: {
         case: 'taskChanged' as const,
         value: { taskId, stage, state, attempt: 1, worker: 'gpu-1' },
@@ -159,20 +246,22 @@ const changed = (secondsAgo: number, seq: number, taskId: string, stage: Stage, 
 });
 
 test('the overview says what bounds the job, and where its time went', TIMEOUT, async () => {
+    // Shares of the time must not depend on how long the tests before took.
+    const now = Date.now();
     const tasks = [
         { taskId: 'plan', stage: Stage.PLAN, state: TaskState.DONE, attempts: 1, seconds: 40 },
         { taskId: 'partition-0000', stage: Stage.PARTITION, state: TaskState.LEASED, attempts: 1 },
         { taskId: 'partition-0001', stage: Stage.PARTITION, partition: 1, state: TaskState.READY },
     ];
-    service.told.job = { ...JOB, tasks, lastSeq: 4n };
+    service.told.job = { ...JOB, createTime: timestampFromMs(now - 600_000), tasks, lastSeq: 4n };
     service.told.events = [
-        changed(600, 1, 'plan', Stage.PLAN, TaskState.LEASED),
-        changed(560, 2, 'plan', Stage.PLAN, TaskState.DONE),
+        changed(now - 600_000, 1, 'plan', Stage.PLAN, TaskState.LEASED),
+        changed(now - 560_000, 2, 'plan', Stage.PLAN, TaskState.DONE),
         {
-            ...changed(560, 3, '', Stage.PARTITION, TaskState.READY),
+            ...changed(now - 560_000, 3, '', Stage.PARTITION, TaskState.READY),
             event: { case: 'jobStage' as const, value: { stage: Stage.PARTITION, tasks: 2 } },
         },
-        changed(530, 4, 'partition-0000', Stage.PARTITION, TaskState.LEASED),
+        changed(now - 530_000, 4, 'partition-0000', Stage.PARTITION, TaskState.LEASED),
     ];
     const timeSpent = {
         seconds: 520,
@@ -183,7 +272,7 @@ test('the overview says what bounds the job, and where its time went', TIMEOUT, 
         watchingSeconds: 10,
     };
     const point = {
-        time: timestampFromMs(NOW),
+        time: timestampFromMs(now),
         attempt: 1,
         progress: { iteration: 900, iterations: 6000, timeSpent },
     };
@@ -210,7 +299,53 @@ test('the overview says what bounds the job, and where its time went', TIMEOUT, 
     );
     assert.match(items[0]!, /^Training: 80 %, \d+ min/);
     await looksRight(opened, 'bounds');
+    const [text, advice] = await page.locator('.bounds > p').allTextContents();
     await finish(opened);
+
+    // The queue says the same of this job.
+    service.told.role = Role.OPERATOR;
+    const queue = await openAs(browser, `${service.address}/#/service/queue`);
+    const cell = queue.page.getByRole('row', { name: 'Transect 7' }).locator('.bound');
+    await cell.getByText('GPU', { exact: true }).waitFor();
+    assert.equal(await cell.locator('.soft').textContent(), `${text} ${advice}`);
+    await looksRight(queue, 'queue-bounds');
+    await finish(queue);
+    delete service.told.role;
+});
+
+test('a long queue has verdicts of its first jobs', TIMEOUT, async () => {
+    // The made-up service tells the same of every job.
+    service.told.jobs = Array.from({ length: MOST_JOBS + 2 }, (_, at) => ({
+        ...service.told.job,
+        jobId: `7-${at}`,
+        name: `Transect ${at}`,
+        priority: -at,
+    }));
+    service.told.role = Role.OPERATOR;
+    service.calls.length = 0;
+    const opened = await openAs(browser, `${service.address}/#/service/queue`);
+    const { page } = opened;
+    const cells = page.locator('.queue tbody .bound');
+    await page.waitForFunction(
+        (most) => document.querySelectorAll('.queue tbody .bound .soft').length === most,
+        MOST_JOBS,
+    );
+    const words = (await cells.allTextContents()).map((text) => text.slice(0, 3));
+    assert.deepEqual(words, [...Array.from({ length: MOST_JOBS }, () => 'GPU'), 'in ', 'in ']);
+    const link = cells.last().getByRole('link', { name: 'in its Overview' });
+    assert.equal(await link.getAttribute('href'), `#/jobs/7-${MOST_JOBS + 1}`);
+    await looksRight(opened, 'queue-long');
+    // Rounds of the queue, in which nobody is asked again.
+    await page.waitForTimeout(4000);
+    const count = (method: string): number => service.calls.filter((one) => one === method).length;
+    assert.deepEqual(
+        ['GetJob', 'WatchJob', 'GetHistory'].map(count),
+        [MOST_JOBS, MOST_JOBS, MOST_JOBS],
+    );
+    assert.equal(service.streams(), 0, 'no stream is left open');
+    await finish(opened);
+    delete service.told.role;
+    delete service.told.jobs;
 });
 
 test('a job that has only begun has no verdict', TIMEOUT, async () => {
@@ -452,10 +587,11 @@ test(
         const done = { ...global, state: TaskState.DONE, model: blobOf('coarse') };
         const waiting = [0, 1, 2, 3].map((index) => partition(index, ''));
         service.told.job = { ...job, tasks: [{ ...global, state: TaskState.LEASED }, ...waiting] };
-        const opened = await open('/viewer');
+        const opened = await openViewer();
         const { page } = opened;
         await page.getByText('as soon as the coarse model has been trained').waitFor();
         service.told.job = { ...job, tasks: [done, ...waiting] };
+        // This first change it finds in its own time.
         await page.getByText('The coarse model. None of 4 partitions has finished.').waitFor();
         await page.waitForFunction(() => document.querySelector<HTMLElement>('.viewer-host')?.fathomViewer);
         assert.deepEqual(await seenAt(page, IN_CELLS), ['blue', 'blue', 'blue', 'blue']);
@@ -470,6 +606,7 @@ test(
             partition(3, 'three'),
         ];
         service.told.job = { ...job, tasks: [done, first, second, third, fourth] };
+        await askAgain(page);
         await page.getByText('There is more: 2 of 4 partitions, the coarse model elsewhere.').waitFor();
         await looksRight(opened, 'composite-newer');
         await showNewer(page);
@@ -484,11 +621,13 @@ test(
         );
         const merge = { taskId: 'merge', stage: Stage.MERGE, state: TaskState.DONE, model: blobOf('whole') };
         service.told.job = { ...job, tasks: [done, merge] };
+        await askAgain(page);
         await page.getByText('There is more: The merged model. Its evaluation follows.').waitFor();
         await showNewer(page);
         assert.deepEqual(await seenAt(page, IN_CELLS), ['green', 'green', 'green', 'green']);
         service.told.files.set('model.ply', carpet('red'));
         service.told.job = { ...job, state: JobState.SUCCEEDED, tasks: [done, merge] };
+        await askAgain(page);
         await page.getByText('There is more: The finished model.').waitFor();
         await showNewer(page);
         assert.deepEqual(await seenAt(page, IN_CELLS), ['red', 'red', 'red', 'red']);
@@ -498,7 +637,7 @@ test(
 
 test('without a coarse model, nothing is seen outside of finished partitions', TIMEOUT, async () => {
     service.told.job = { ...JOB, plan: blobOf('plan'), tasks: [partition(2, 'zero'), partition(3, '')] };
-    const opened = await open('/viewer');
+    const opened = await openViewer();
     const { page } = opened;
     await page.getByText('1 of 4 partitions, nothing elsewhere.').waitFor();
     await page.waitForFunction(() => document.querySelector<HTMLElement>('.viewer-host')?.fathomViewer);
@@ -508,7 +647,7 @@ test('without a coarse model, nothing is seen outside of finished partitions', T
 
 test('a model that is gone is told, and the viewer stays with what it has', TIMEOUT, async () => {
     service.told.job = { ...JOB, plan: blobOf('plan'), tasks: [partition(2, 'zero'), partition(3, '')] };
-    const opened = await open('/viewer');
+    const opened = await openViewer();
     const { page } = opened;
     await page.waitForFunction(() => document.querySelector<HTMLElement>('.viewer-host')?.fathomViewer);
     service.told.job = {
@@ -516,6 +655,7 @@ test('a model that is gone is told, and the viewer stays with what it has', TIME
         plan: blobOf('plan'),
         tasks: [partition(2, 'zero'), partition(3, 'missing')],
     };
+    await askAgain(page);
     await page.getByRole('button', { name: 'Show it' }).click();
     await page.getByText('The newer model cannot be shown.').waitFor();
     assert.deepEqual(await seenAt(page, IN_CELLS), ['none', 'none', 'red', 'none']);
@@ -550,7 +690,7 @@ const COPY_LINE = 'A copy for viewing: 61.0 MB instead of 248 MB.';
 
 test('of a large finished model the copy is seen first, and the whole model on request', LONG_TIMEOUT, async () => {
     finishedWith(248e6, 61e6);
-    const opened = await open('/viewer');
+    const opened = await openViewer();
     const { page } = opened;
     await page.getByText(COPY_LINE, { exact: true }).waitFor();
     await waitForViewer(page);
@@ -583,7 +723,7 @@ test('of a large finished model the copy is seen first, and the whole model on r
 
 test('a small finished model is loaded itself, and a huge copy only after a question', TIMEOUT, async () => {
     finishedWith(null, null);
-    const small = await open('/viewer');
+    const small = await openViewer();
     await waitForViewer(small.page);
     assert.deepEqual(await seenAt(small.page, IN_CELLS), ['red', 'red', 'red', 'red']);
     assert.deepEqual([timesAsked('model.compressed.ply'), timesAsked('model.ply')], [0, 1]);
@@ -592,7 +732,7 @@ test('a small finished model is loaded itself, and a huge copy only after a ques
     await finish(small);
 
     finishedWith(800e6, 200e6);
-    const huge = await open('/viewer');
+    const huge = await openViewer();
     await huge.page.getByRole('button', { name: 'Load the model (200 MB)' }).waitFor();
     assert.deepEqual([timesAsked('model.compressed.ply'), timesAsked('model.ply')], [0, 0]);
     await finish(huge);

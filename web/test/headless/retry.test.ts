@@ -16,7 +16,7 @@ import { areaOf, cameraAt, placeCameras, project } from '../../src/pages/parts/p
 import type { ManifestContent, MapCamera, PlanContent, PlanPartition, Projection } from '../../src/pages/parts/plan-layout.ts';
 import { launch } from './browser.ts';
 import { type JobJson, Service, serveWith } from './service.ts';
-import { type Opened, accessible, finish, openAs, sleep, until } from './steps.ts';
+import { type Opened, accessible, askAgain, finish, openAs, sleep, until } from './steps.ts';
 
 const FATHOM = process.env['FATHOM'] ?? '';
 const PAGES = process.env['PAGES'] ?? join(import.meta.dirname, '../../dist');
@@ -411,9 +411,12 @@ test('curves are the same after the coordinator was killed and started again', {
     await sleep(Math.max(0, ended * 1000 + KEPT_AFTER_MS - Date.now()));
     const kept = await history();
     await service.kill();
+    // Of a job that has ended a page asks seldom.
+    await askAgain(page);
     await page.getByText('Connection lost; trying again').waitFor();
     assert.deepEqual(await wrongCurves(page, kept.tasks), [], 'what was shown stays');
     await service.startCoordinator();
+    await askAgain(page);
     await page.getByText('Connection lost; trying again').waitFor({ state: 'detached' });
     await page.reload();
     const { tasks } = await history();

@@ -14,7 +14,7 @@ import { promisify } from 'node:util';
 import type { Browser } from 'playwright-core';
 
 import type { CameraEntry, Mode } from '../../src/viewer/index.ts';
-import { SMALL_WINDOW, launch, newPage } from './browser.ts';
+import { SMALL_WINDOW, launch, newPage, shrinkViewer } from './browser.ts';
 import { psnr, readPng } from './pictures.ts';
 import { serve } from './server.ts';
 
@@ -120,6 +120,7 @@ for (const [name, goal] of Object.entries(GOALS)) {
         const { page, complaints } = await newPage(browser, { viewport: SMALL_WINDOW });
         await page.goto(`${serving.address}/other/view.html`);
         await page.waitForFunction(() => document.querySelector<HTMLElement>('#viewer')?.fathomViewer, null, TIMEOUT);
+        await shrinkViewer(page);
         for (const mode of ['clear', 'water'] as const) {
             const values: number[] = [];
             for (const camera of cameras.filter((_, i) => i % 2 === 0)) {

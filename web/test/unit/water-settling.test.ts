@@ -10,11 +10,12 @@ import { isInAir, waterSeriesOf } from '../../src/pages/job/water-history.ts';
 import {
     type WaterSeries,
     bandOf,
+    errorBandOf,
     firstShown,
     spreadOfPartitions,
     waterAt,
 } from '../../src/pages/parts/water-points.ts';
-import { patch } from '../../src/pages/parts/water-values.ts';
+import { drawnError, patch, valuesOf } from '../../src/pages/parts/water-values.ts';
 import { checkWater } from '../../src/viewer/water.ts';
 import { Stage, TaskHistorySchema, TaskSchema } from '../../src/rpc/fathom/v1/job_pb.ts';
 
@@ -60,6 +61,61 @@ test('only points with all nine numbers are kept, by task in the order of the jo
         { task: 'global', label: 'Coarse model', stage: 'global', points: [point] },
         { task: 'partition-0001', label: 'Partition 1', stage: 'partition', points: [point] },
     ]);
+});
+
+test('points keep their standard errors, where reported', () => {
+    const rgb = { red: 1, green: 2, blue: 3 };
+    const time = timestampFromMs(7000);
+    const water = { betaD: rgb, betaB: rgb, bInf: rgb };
+    const standardError = { betaD: { red: 0.5, blue: 0.25 }, bInf: { red: NaN, green: -1, blue: 0 } };
+    const [found] = waterSeriesOf(
+        [create(TaskSchema, { taskId: 'global', stage: Stage.GLOBAL })],
+        [
+            create(TaskHistorySchema, {
+                taskId: 'global',
+                points: [
+                    { time, attempt: 1, progress: { iteration: 5, water } },
+                    { time, attempt: 1, progress: { iteration: 6, water: { ...water, standardError } } },
+                ],
+            }),
+        ],
+    );
+    const [before, after] = found!.points;
+    assert.ok(!('standard_error' in before!), 'a worker that reports none');
+    assert.ok(!('standard_error' in waterAt(before!)));
+    assert.deepEqual(after!.standard_error, {
+        beta_d: [0.5, null, 0.25],
+        beta_b: null,
+        b_inf: [null, null, 0],
+    });
+    const shown = valuesOf(waterAt(after!), 'beta_d', null);
+    assert.deepEqual(
+        shown.map(({ value, error }) => [value, error]),
+        [
+            [1, 0.5],
+            [2, null],
+            [3, 0.25],
+        ],
+    );
+});
+
+test('a band of errors has gaps where nothing is determined', () => {
+    const one = series('a', 'partition', 1, 2, 3);
+    const errors = [0.5, null, 100];
+    const points = one.points.map((point, i) => ({
+        ...point,
+        standard_error: { beta_d: [errors[i]!, null, null] as const, beta_b: null },
+    }));
+    const band = errorBandOf({ ...one, points }, 'beta_d', 0, 12)!;
+    assert.deepEqual(band.lower, { xs: [0, 100, 200], ys: [3.5, null, 0] });
+    // The largest value is 12, so that of 100 only 12 and a quarter more are drawn.
+    assert.deepEqual(band.upper, { xs: [0, 100, 200], ys: [4.5, null, 12 + drawnError(12, 100, 12)] });
+    assert.equal(drawnError(12, 100, 12), 15);
+    assert.ok(band.isCut);
+    assert.ok(!errorBandOf({ ...one, points: points.slice(0, 2) }, 'beta_d', 0, 12)!.isCut);
+    assert.equal(errorBandOf({ ...one, points }, 'beta_d', 1, 12), null);
+    assert.equal(errorBandOf({ ...one, points }, 'b_inf', 0, 12), null);
+    assert.equal(errorBandOf(one, 'beta_d', 0, 12), null, 'an old history');
 });
 
 test('the first task that trains its water in the last stage that does is shown first', () => {

@@ -4,10 +4,13 @@
 // workers hold tasks, the time is divided evenly among these tasks, and that of each task by what its
 // attempts reported. Pauses do not count.
 
+import { timestampMs } from '@bufbuild/protobuf/wkt';
+
 import type { HistoryPoint, TaskHistory, TimeSpent } from '../../rpc/fathom/v1/job_pb.ts';
 import { durationText } from '../format.ts';
 import type { TaskInfo } from '../parts/part.ts';
 import { type TimelineEvent, attemptsOf } from '../parts/timeline-bars.ts';
+import type { JobRecord } from './record.ts';
 
 /** Where time goes. */
 export type Part =
@@ -26,6 +29,18 @@ export const PART_WORDS: Readonly<Record<Part, string>> = {
     unknown: 'Other',
 };
 const PARTS = Object.keys(PART_WORDS) as Part[];
+
+/** What bounds a job, in as few words as a table takes. */
+export const BOUND_WORDS: Readonly<Record<Bound, string>> = {
+    training: 'GPU',
+    disk: 'Reading from disk',
+    photographs: 'Decoding photographs',
+    network: 'Network',
+    watching: 'Measuring and saving',
+    coordinator: 'Coordinator',
+    waiting: 'Lack of workers',
+    nothing: 'Nothing alone',
+};
 
 export interface BoundsData {
     readonly tasks: readonly TaskInfo[];
@@ -384,6 +399,16 @@ export function verdictOf(data: BoundsData): Verdict | null {
             ({ share }) => share >= 0.005,
         ),
     };
+}
+
+/** What bounds a job of which this is known; null also before its first snapshot. */
+export function verdictOfJob(record: JobRecord, histories: readonly TaskHistory[]): Verdict | null {
+    const { job, tasks, events, nowMs } = record;
+    if (job?.createTime === undefined) {
+        return null;
+    }
+    const { createTime, maxParallel } = job;
+    return verdictOf({ tasks, histories, events, startMs: timestampMs(createTime), nowMs, maxParallel });
 }
 
 /** A part in words, for its legend and for screen readers. */

@@ -12,6 +12,12 @@ const SELDOM_MS = 60_000;
 /** The history of a job with many tasks has megabytes: each point makes the pause so much longer. */
 const MS_PER_POINT = 0.5;
 
+/** How long to wait before the history of a job is asked for again, `leastMs` at least. */
+export function pauseAfter({ tasks }: Pick<History, 'tasks'>, leastMs: number): number {
+    const points = tasks.reduce((sum, task) => sum + task.points.length, 0);
+    return Math.min(SELDOM_MS, leastMs + MS_PER_POINT * points);
+}
+
 /** Asks for the history of a job again and again, every `leastMs` at most, until the section is left. */
 export function followHistory(
     context: JobContext,
@@ -20,13 +26,12 @@ export function followHistory(
     leastMs = EVERY_MS,
 ): Polling {
     const { id, session, signal } = context;
-    let points = 0;
-    const every = (): number =>
-        hasEnded(context.job.state) ? SELDOM_MS : Math.min(SELDOM_MS, leastMs + MS_PER_POINT * points);
+    let pauseMs = leastMs;
+    const every = (): number => (hasEnded(context.job.state) ? SELDOM_MS : pauseMs);
     return poll(every, signal, async () => {
         try {
             const history = await session.api.jobs.getHistory({ jobId: id }, { signal });
-            points = history.tasks.reduce((sum, task) => sum + task.points.length, 0);
+            pauseMs = pauseAfter(history, leastMs);
             onHistory(history);
         } catch (error) {
             onFault(faultOf(error));

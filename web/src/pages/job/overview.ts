@@ -1,7 +1,5 @@
 // What a job does now: its plan from above, its stages in time, and its tasks.
 
-import { timestampMs } from '@bufbuild/protobuf/wkt';
-
 import { type Task, type TaskHistory, TaskState } from '../../rpc/fathom/v1/job_pb.ts';
 import { Table, chip, h, only, setText } from '../dom.ts';
 import { countText, durationText } from '../format.ts';
@@ -11,7 +9,7 @@ import { timeline } from '../parts/timeline.ts';
 import { capital, hasEnded, taskLabel, taskStateWord } from '../words.ts';
 import { Addresses } from './addresses.ts';
 import { boundsBar } from './bounds-bar.ts';
-import { verdictOf } from './bounds.ts';
+import { verdictOfJob } from './bounds.ts';
 import { followHistory } from './history.ts';
 import { Photographs } from './photographs.ts';
 import { withPreviews } from './preview-series.ts';
@@ -133,13 +131,10 @@ export function open(container: HTMLElement, context: JobContext): Section {
     let countTimer = 0;
     function count(): void {
         countTimer = 0;
-        const { createTime, maxParallel } = context.job;
         // Without the history nobody can tell training from waiting for photographs.
-        if (signal.aborted || histories === null || createTime === undefined) {
-            return;
+        if (!signal.aborted && histories !== null) {
+            bounds.show(verdictOfJob(record, histories));
         }
-        const { tasks, events, nowMs } = record;
-        bounds.show(verdictOf({ tasks, histories, events, startMs: timestampMs(createTime), nowMs, maxParallel }));
     }
     followHistory(
         context,

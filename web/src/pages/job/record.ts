@@ -73,6 +73,11 @@ export class JobRecord {
     lastSeq = 0n;
     #clockAheadMs = 0;
 
+    /** Takes the present by the clock of the service. */
+    clock(timeMs: number): void {
+        this.#clockAheadMs = timeMs - Date.now();
+    }
+
     /** Takes a snapshot. One that is older than the events is refused. */
     snapshot(job: Job): boolean {
         if (job.lastSeq < this.lastSeq) {
@@ -86,7 +91,7 @@ export class JobRecord {
     apply(event: JobEvent): boolean {
         if (event.event.case === 'keepAlive' || event.event.case === 'progress') {
             // These are sent at once, so they show the clock of the service.
-            this.#clockAheadMs = event.time === undefined ? 0 : timestampMs(event.time) - Date.now();
+            this.clock(event.time === undefined ? Date.now() : timestampMs(event.time));
         }
         if (event.event.case === 'keepAlive') {
             return false;

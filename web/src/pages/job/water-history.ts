@@ -2,8 +2,15 @@
 
 import { timestampMs } from '@bufbuild/protobuf/wkt';
 
-import type { Rgb, Task, TaskHistory } from '../../rpc/fathom/v1/job_pb.ts';
+import type {
+    Rgb,
+    RgbErrors,
+    Task,
+    TaskHistory,
+    WaterErrors as ReportedErrors,
+} from '../../rpc/fathom/v1/job_pb.ts';
 import type { WaterPoint, WaterSeries } from '../parts/water-points.ts';
+import type { MaybeVec3, WaterErrors } from '../parts/water-values.ts';
 import { stageWord, taskLabel } from '../words.ts';
 
 type Three = readonly [number, number, number];
@@ -12,6 +19,17 @@ const three = (rgb: Rgb | undefined): Three | null => {
     const values: Three | null = rgb === undefined ? null : [rgb.red, rgb.green, rgb.blue];
     return values !== null && values.every(Number.isFinite) ? values : null;
 };
+
+const errorOf = (error: number | undefined): number | null =>
+    error !== undefined && Number.isFinite(error) && error >= 0 ? error : null;
+const threeErrors = (rgb: RgbErrors | undefined): MaybeVec3 | null =>
+    rgb === undefined ? null : [errorOf(rgb.red), errorOf(rgb.green), errorOf(rgb.blue)];
+
+const errorsOf = ({ betaD, betaB, bInf }: ReportedErrors): WaterErrors => ({
+    beta_d: threeErrors(betaD),
+    beta_b: threeErrors(betaB),
+    b_inf: threeErrors(bInf),
+});
 
 function pointsOf({ points }: TaskHistory): readonly WaterPoint[] {
     return points.flatMap(({ progress, attempt, time }) => {
@@ -29,7 +47,16 @@ function pointsOf({ points }: TaskHistory): readonly WaterPoint[] {
         ) {
             return [];
         }
-        return [{ timeMs: timestampMs(time), attempt, iteration: progress.iteration, beta_d, beta_b, b_inf }];
+        const point = {
+            timeMs: timestampMs(time),
+            attempt,
+            iteration: progress.iteration,
+            beta_d,
+            beta_b,
+            b_inf,
+        };
+        const reported = progress.water?.standardError;
+        return [reported === undefined ? point : { ...point, standard_error: errorsOf(reported) }];
     });
 }
 

@@ -1,4 +1,4 @@
-// The water of a job: as it settles while tasks train it, and with its errors once the job has succeeded.
+// The water of a job with its errors: as it settles while tasks train it, and once the job has succeeded.
 
 import type { TaskHistory } from '../../rpc/fathom/v1/job_pb.ts';
 import { JobState } from '../../rpc/fathom/v1/job_pb.ts';
@@ -29,7 +29,7 @@ function emptyText(context: JobContext): string {
     }
     return hasEnded(state)
         ? 'The job did not succeed, and none of its tasks reported a water.'
-        : 'The water is shown here while it trains, and with its standard errors once the job has succeeded.';
+        : 'The water is shown here while it trains and once the job has succeeded, with its standard errors.';
 }
 
 export function open(container: HTMLElement, context: JobContext): Section {
@@ -111,7 +111,7 @@ export function open(container: HTMLElement, context: JobContext): Section {
         }
         if (isSettling) {
             settling ??= waterSettling(settlingHost);
-            settling.update({ series, showsColours: !hasFinal, viewingDistance });
+            settling.update({ series, showsLatest: !hasFinal, viewingDistance });
         }
     }
 

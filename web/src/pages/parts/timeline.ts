@@ -25,6 +25,9 @@ const FIRST_NOTES = 20;
 /** Least width of a bar, percent of the track: the shortest attempt can still be seen and hit. */
 const LEAST_BAR = 0.4;
 
+/** The width that a letter of a label of the axis may need, pixels. */
+const LETTER_PX = 7;
+
 export function timeline(container: HTMLElement): Part<TimelineData> {
     const view = new TimelineView();
     container.append(view.element);
@@ -139,9 +142,14 @@ class TimelineView implements Part<TimelineData> {
         const at = (ms: number): string => `${(100 * ms) / length}%`;
         const marks: HTMLElement[] = [];
         for (let ms = 0; ms <= length; ms += step) {
-            const mark = h('span', { class: 'fp-time-mark' }, h('span', {}, ms === 0 ? '0' : duration(ms)));
+            const text = ms === 0 ? '0' : duration(ms);
+            const isLast = ms / length > 0.94;
+            // On a phone the label of a mark near the end would leave the window.
+            const room = (1 - ms / length) * this.#axis.clientWidth;
+            const hasRoom = isLast || ms === 0 || room >= LETTER_PX * text.length;
+            const mark = h('span', { class: 'fp-time-mark' }, h('span', {}, hasRoom ? text : ''));
             mark.style.left = at(ms);
-            mark.classList.toggle('fp-time-last', ms / length > 0.94);
+            mark.classList.toggle('fp-time-last', isLast);
             marks.push(mark);
         }
         for (const pause of pauses) {

@@ -98,18 +98,25 @@ class WaterPanel implements Part<WaterData> {
             return;
         }
         const partition = water.partitions?.find((one) => String(one.partition) === this.#select.value) ?? null;
-        const remarks = [...remarksOf(water), ...errorRemarks(water, partition)].map((text) =>
-            h('p', { class: 'fp-note' }, text),
-        );
-        const parameters = (Object.keys(PARAMETERS) as Parameter[]).map((parameter) =>
-            parameterTable(water, parameter, partition),
-        );
         this.#content.replaceChildren(
-            h('div', { class: 'fp-water-grid' }, ...parameters),
-            h('div', { class: 'fp-water-remarks' }, ...remarks),
+            ...numberTables(water, partition),
             colourTable(waterOf(water, partition), viewingDistance),
         );
     }
+}
+
+/** The nine numbers with their errors, and what has to be said about them. */
+export function numberTables(water: WaterContent, partition: PartitionWater | null): HTMLElement[] {
+    const remarks = [...remarksOf(water), ...errorRemarks(water, partition)].map((text) =>
+        h('p', { class: 'fp-note' }, text),
+    );
+    const parameters = (Object.keys(PARAMETERS) as Parameter[]).map((parameter) =>
+        parameterTable(water, parameter, partition),
+    );
+    return [
+        h('div', { class: 'fp-water-grid' }, ...parameters),
+        h('div', { class: 'fp-water-remarks' }, ...remarks),
+    ];
 }
 
 /** What the columns leave unsaid. */

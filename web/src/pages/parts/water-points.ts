@@ -2,13 +2,21 @@
 
 import type { Vec3 } from '../../viewer/vector.ts';
 import type { Line, Moment } from './curve-points.ts';
-import { PARAMETERS, type Parameter, type WaterContent } from './water-values.ts';
+import {
+    PARAMETERS,
+    type Parameter,
+    type WaterContent,
+    type WaterErrors,
+    drawnError,
+} from './water-values.ts';
 
 /** The water parameters of a task at one moment. */
 export interface WaterPoint extends Moment {
     readonly beta_d: Vec3;
     readonly beta_b: Vec3;
     readonly b_inf: Vec3;
+    /** Absent where workers do not report errors. */
+    readonly standard_error?: WaterErrors;
 }
 
 /** The water of one task. */
@@ -37,13 +45,14 @@ export function firstShown(series: readonly WaterSeries[]): WaterSeries | null {
 }
 
 /** A water with the numbers of one moment, as `patch` takes it; what else water.json says is not known yet. */
-export const waterAt = ({ beta_d, beta_b, b_inf }: WaterPoint): WaterContent => ({
+export const waterAt = ({ beta_d, beta_b, b_inf, standard_error }: WaterPoint): WaterContent => ({
     format: 2,
     medium: 'per_pixel',
     blend: 'srgb',
     beta_d,
     beta_b,
     b_inf,
+    ...(standard_error === undefined ? {} : { standard_error }),
 });
 
 /** The lowest, the highest and the mean value of several tasks along the iterations. */
@@ -107,6 +116,42 @@ export function bandOf(series: readonly WaterSeries[], valueOf: (point: WaterPoi
     });
     const line = (ys: number[]): Line => ({ xs, ys });
     return xs.length === 0 ? null : { lowest: line(lowest), highest: line(highest), mean: line(mean) };
+}
+
+/** One standard error to each side of a line. */
+export interface ErrorBand {
+    readonly lower: Line;
+    readonly upper: Line;
+    /** Whether an error is so large that not all of it is drawn. */
+    readonly isCut: boolean;
+}
+
+/**
+ * The errors of one number along the iterations, with gaps where it is not determined; null where it never
+ * is. `top` is the largest value of the chart.
+ */
+export function errorBandOf(
+    { points }: WaterSeries,
+    name: Parameter,
+    channel: number,
+    top: number,
+): ErrorBand | null {
+    const xs = points.map(({ iteration }) => iteration);
+    const errors = points.map(({ standard_error }) => standard_error?.[name]?.[channel] ?? null);
+    if (errors.every((error) => error === null)) {
+        return null;
+    }
+    const values = points.map((point) => point[name][channel]!);
+    const edge = (at: (value: number, error: number) => number): Line => ({
+        xs,
+        ys: values.map((value, i) => (errors[i] === null ? null : at(value, errors[i]!))),
+    });
+    return {
+        // No number of the water is negative.
+        lower: edge((value, error) => Math.max(0, value - error)),
+        upper: edge((value, error) => value + drawnError(value, error, top)),
+        isCut: values.some((value, i) => drawnError(value, errors[i] ?? 0, top) < (errors[i] ?? 0)),
+    };
 }
 
 /** How far the latest values of one parameter and channel lie apart. */

@@ -16,18 +16,19 @@ import {
     type WaterPoint,
     type WaterSeries,
     bandOf,
+    errorBandOf,
     firstShown,
     spreadOfPartitions,
     waterAt,
 } from './water-points.ts';
-import { colourTable } from './water-panel.ts';
+import { colourTable, numberTables } from './water-panel.ts';
 import { CHANNELS, PARAMETERS, type Parameter } from './water-values.ts';
 
 export interface WaterSettlingData {
     /** In the order of the tasks. */
     readonly series: readonly WaterSeries[];
-    /** Whether the colours that the latest water makes are shown. */
-    readonly showsColours?: boolean;
+    /** Whether the latest water is shown: its numbers with their errors, and the colours that it makes. */
+    readonly showsLatest?: boolean;
     /** `extent.viewing_distance` of plan.json, scene units. */
     readonly viewingDistance?: number | null;
 }
@@ -78,13 +79,48 @@ function bandLines(series: readonly WaterSeries[], name: Parameter, channel: num
     ];
 }
 
+interface ErrorLines {
+    readonly lines: readonly DrawnLine[];
+    /** Whether an error is so large that not all of it is drawn. */
+    readonly isCut: boolean;
+}
+
+/** One standard error around the line of each channel, where it is determined. */
+function errorLines(series: WaterSeries, name: Parameter): ErrorLines {
+    const top = Math.max(...series.points.flatMap((point) => point[name]), 1e-9);
+    let isCut = false;
+    const lines = CHANNELS.flatMap((_, channel): DrawnLine[] => {
+        const band = errorBandOf(series, name, channel, top);
+        if (band === null) {
+            return [];
+        }
+        isCut ||= band.isCut;
+        const common = { label: '', colour: COLOURS[channel]!, dash: [], isBehind: true, isEdge: true };
+        const [lower, upper] = [`${series.task} lower ${channel}`, `${series.task} upper ${channel}`];
+        return [
+            { ...common, task: lower, line: band.lower },
+            { ...common, task: upper, line: band.upper, bandTo: lower },
+        ];
+    });
+    return { lines, isCut };
+}
+
+/** What the bands around lines are. */
+function bandWords(errors: readonly ErrorLines[]): string {
+    if (errors.every(({ lines }) => lines.length === 0)) {
+        return '';
+    }
+    const cut = errors.some(({ isCut }) => isCut) ? ' The largest are cut off above.' : '';
+    return ` Bands: ± one standard error.${cut}`;
+}
+
 class WaterSettling implements Part<WaterSettlingData> {
     readonly element = h('div', { class: 'fp fp-water' });
     readonly #select: HTMLSelectElement;
     readonly #picker: HTMLElement;
     readonly #about = h('p', { class: 'fp-note fp-curve-hint' });
     readonly #charts: ReadonlyMap<Parameter, Chart>;
-    readonly #colours = h('div', { class: 'fp-water-now', hidden: true });
+    readonly #latest = h('div', { class: 'fp-water-now', hidden: true });
     readonly #spread = h('section', { class: 'fp-water-spread', hidden: true });
     readonly #table = foldedTable(
         'The latest water of each task as a table',
@@ -100,8 +136,8 @@ class WaterSettling implements Part<WaterSettlingData> {
     readonly #stop: () => void;
     #series: readonly WaterSeries[] = [];
     #data: WaterSettlingData = { series: [] };
-    /** Of which moment the colours are. */
-    #coloursOf = '';
+    /** Of which moment the numbers and colours are. */
+    #latestOf = '';
     #options = '';
     #isChosen = false;
     #zoom: Zoom | null = null;
@@ -132,7 +168,7 @@ class WaterSettling implements Part<WaterSettlingData> {
             this.#picker,
             this.#about,
             h('div', { class: 'fp-water-grid fp-water-curves' }, ...charts.map(({ element }) => element)),
-            this.#colours,
+            this.#latest,
             this.#spread,
             this.#table.element,
         );
@@ -189,11 +225,15 @@ class WaterSettling implements Part<WaterSettlingData> {
         const last = shown.points.at(-1)!;
         const place = `${shown.label} at iteration ${grouped(last.iteration)}.`;
         const whole = spanOf(ofStage, 'iteration', 0);
-        let hasBands = false;
+        // What is drawn last lies on top.
+        const between = new Map(
+            NAMES.map((name) => [name, CHANNELS.flatMap((_, i) => bandLines(ofStage, name, i))]),
+        );
+        // Two kinds of bands of the same colours could not be told apart.
+        const isSpread = [...between.values()].some((lines) => lines.length > 0);
+        const errors = new Map(NAMES.map((name) => [name, errorLines(shown, name)]));
         for (const [name, chart] of this.#charts) {
-            // What is drawn last lies on top.
-            const bands = CHANNELS.flatMap((_, i) => bandLines(ofStage, name, i));
-            hasBands ||= bands.length > 0;
+            const bands = isSpread ? between.get(name)! : errors.get(name)!.lines;
             const own = CHANNELS.map((channel, i): DrawnLine => ({
                 task: `${shown.task} ${channel}`,
                 label: channel,
@@ -203,24 +243,27 @@ class WaterSettling implements Part<WaterSettlingData> {
             }));
             chart.draw([...bands, ...own], 'iteration', whole, this.#zoom);
         }
-        const others = hasBands
+        const drawn = isSpread
             ? ` Bands: lowest to highest of ${counted(ofStage.length, 'task')} of this stage, dashed: their mean.`
-            : '';
-        setText(this.#about, `${place} Lines are red, green and blue light.${others}`);
-        this.#drawColours(shown, last);
+            : bandWords([...errors.values()]);
+        setText(this.#about, `${place} Lines are red, green and blue light.${drawn}`);
+        this.#drawLatest(shown, last);
         this.#drawSpread();
         this.#table.refresh();
     }
 
-    #drawColours(shown: WaterSeries, last: WaterPoint): void {
-        const { showsColours = false, viewingDistance = null } = this.#data;
-        this.#colours.hidden = !showsColours;
+    #drawLatest(shown: WaterSeries, last: WaterPoint): void {
+        const { showsLatest = false, viewingDistance = null } = this.#data;
+        this.#latest.hidden = !showsLatest;
         const key = `${shown.task} ${last.attempt} ${last.iteration} ${viewingDistance}`;
         // Made only for another water, so that a selection stays.
-        if (showsColours && key !== this.#coloursOf) {
-            this.#coloursOf = key;
+        if (showsLatest && key !== this.#latestOf) {
+            this.#latestOf = key;
+            const water = waterAt(last);
             const whose = `The latest water of ${shown.label}, at iteration ${grouped(last.iteration)}.`;
-            this.#colours.replaceChildren(colourTable(waterAt(last), viewingDistance, whose));
+            // Without errors the numbers below the charts say the same.
+            const numbers = last.standard_error === undefined ? [] : numberTables(water, null);
+            this.#latest.replaceChildren(...numbers, colourTable(water, viewingDistance, whose));
         }
     }
 
@@ -275,7 +318,12 @@ class WaterSettling implements Part<WaterSettlingData> {
             return [
                 label,
                 grouped(last.iteration),
-                ...NAMES.flatMap((name) => last[name].map((value) => brief(value))),
+                ...NAMES.flatMap((name) =>
+                    last[name].map((value, channel) => {
+                        const error = last.standard_error?.[name]?.[channel] ?? null;
+                        return error === null ? brief(value) : `${brief(value)} ±\u00a0${brief(error, 2)}`;
+                    }),
+                ),
             ];
         });
     }

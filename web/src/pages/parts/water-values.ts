@@ -4,15 +4,18 @@ import type { Vec3 } from '../../viewer/vector.ts';
 import { type WaterRecord, coefficients, decoded, encoded, openWater, seenLight } from '../../viewer/water.ts';
 import { brief } from './format.ts';
 
-type MaybeVec3 = readonly [number | null, number | null, number | null];
+export type MaybeVec3 = readonly [number | null, number | null, number | null];
+
+/** One standard error of each number; null where nothing determines it. */
+export interface WaterErrors {
+    readonly beta_d?: MaybeVec3 | null;
+    readonly beta_b?: MaybeVec3 | null;
+    readonly b_inf?: MaybeVec3 | null;
+}
 
 /** The content of water.json. */
 export interface WaterContent extends WaterRecord {
-    readonly standard_error?: {
-        readonly beta_d?: MaybeVec3 | null;
-        readonly beta_b?: MaybeVec3 | null;
-        readonly b_inf?: MaybeVec3 | null;
-    } | null;
+    readonly standard_error?: WaterErrors | null;
     readonly source?: string;
     readonly shows_open_water?: boolean;
     readonly beta_d_per_m?: Vec3 | null;
@@ -93,11 +96,18 @@ export function valuesOf(water: WaterContent, parameter: Parameter, partition: P
     }));
 }
 
-/** The largest value with its error, for the length of bars; errors much larger than all values do not count. */
+/**
+ * How much of an error above a value is drawn. Errors much larger than all values, of which `top` is the
+ * largest, would leave no room for the values.
+ */
+export const drawnError = (value: number, error: number, top: number): number =>
+    Math.min(error, value + 0.25 * top);
+
+/** The largest value with its error, for the length of bars. */
 export function longest(values: readonly WaterValue[]): number {
     const top = Math.max(...values.map(({ value }) => value), 1e-9);
-    const reach = Math.max(...values.map(({ value, error }) => value + Math.min(error ?? 0, value + 0.25 * top)));
-    return Math.max(reach, top);
+    const reach = values.map(({ value, error }) => value + drawnError(value, error ?? 0, top));
+    return Math.max(...reach, top);
 }
 
 /** Surfaces that readers know, in sRGB as they look in air. */

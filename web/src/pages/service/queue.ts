@@ -1,4 +1,4 @@
-// What the service works on, in the order in which workers take it, and what is lacking.
+// What the service works on, in the order in which workers take it, what bounds it, and what is lacking.
 
 import { timestampMs } from '@bufbuild/protobuf/wkt';
 
@@ -9,7 +9,9 @@ import { faultOf } from '../faults.ts';
 import { agoText, percentText } from '../format.ts';
 import { poll } from '../poll.ts';
 import { jobLink } from '../route.ts';
+import { VISIBILITY } from '../visibility.ts';
 import { capital, shownState, stageLabel } from '../words.ts';
+import { BoundsOfJobs, showBound, sourceOf } from './bounds-of-jobs.ts';
 
 const EVERY_MS = 3000;
 /** More open jobs are counted but not shown. */
@@ -24,6 +26,8 @@ export const inOrder = (jobs: readonly Job[]): readonly Job[] =>
 export function showQueue(container: HTMLElement, context: Context): void {
     const { session, signal } = context;
     let now = Date.now();
+    let queue: readonly Job[] = [];
+    const bounds = new BoundsOfJobs(sourceOf(session.api), VISIBILITY, signal, () => table.show(queue));
     const table = new Table<Job>(
         'Jobs that have not ended',
         'queue',
@@ -36,9 +40,14 @@ export function showQueue(container: HTMLElement, context: Context): void {
             },
             { title: 'State', kind: 'state', show: (cell, job) => chip(cell, shownState(job), capital(shownState(job))) },
             { title: 'Progress', kind: 'number', show: (cell, { progress }) => setText(cell, percentText(progress)) },
-            { title: 'Stage', show: (cell, { stage }) => setText(cell, stageLabel(stage)) },
-            { title: 'Tenant', show: (cell, { tenant }) => setText(cell, tenant) },
+            { title: 'Stage', kind: 'stage', show: (cell, { stage }) => setText(cell, stageLabel(stage)) },
+            { title: 'Tenant', kind: 'tenant', show: (cell, { tenant }) => setText(cell, tenant) },
             { title: 'Priority', kind: 'number', show: (cell, { priority }) => setText(cell, String(priority)) },
+            {
+                title: 'What bounds it',
+                kind: 'bound',
+                show: (cell, { jobId }) => showBound(cell, jobId, bounds.of(jobId)),
+            },
             {
                 title: 'What is lacking',
                 kind: 'wide',
@@ -59,12 +68,15 @@ export function showQueue(container: HTMLElement, context: Context): void {
             const { jobs, nextPageToken } = await session.api.jobs.listJobs(request, { signal });
             now = Date.now();
             content.hidden = false;
+            queue = inOrder(jobs);
+            // The rows are shown at once; the answers change them.
+            void bounds.take(queue);
             if (jobs.length === 0) {
                 setText(summary, '');
                 content.replaceChildren(h('div', { class: 'empty' }, h('h2', {}, 'The queue is empty'), h('p', {}, 'All jobs have ended.')));
                 return;
             }
-            table.show(inOrder(jobs));
+            table.show(queue);
             if (table.element.parentElement !== content) {
                 content.replaceChildren(table.element);
             }
