@@ -1,7 +1,9 @@
-//@ import frame, counters, gaussian, splat, gather_slots
+//@ import frame, counters, gaussian, rows, gather_slots, sums_of_bands
+//@ variant add_band_gradients rows=splat+splat_rows sums_of_bands=splat_sums+keep_splat_sums
+//@ variant add_disk_band_gradients rows=disk+disk_rows sums_of_bands=disk_sums+keep_disk_sums
 // Adds the slot gradients of one band of tiles to the sums of the bands before it.
 //
-//   band_gradients [N*3]  vec4, as in splat.wgsl: per Gaussian of the block
+//   band_gradients [N*3]  vec4, as in splat.wgsl: per Gaussian of the block; [N*5] of disks, as in disk.wgsl
 // Tiles are emitted in reading order and bands follow it, so the sum equals that of a single band to the bit.
 // One thread per Gaussian of the block that the band sees.
 
@@ -18,10 +20,6 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     if visible_id == NONE {
         return;
     }
-    let at = 3u * gaussian_from_visible[visible_id];
-    let before = Splat(band_gradients[at], band_gradients[at + 1u], band_gradients[at + 2u]);
-    let sum = add_slots(segments[visible_id], before);
-    band_gradients[at] = sum.a;
-    band_gradients[at + 1u] = sum.b;
-    band_gradients[at + 2u] = sum.c;
+    let i = gaussian_from_visible[visible_id];
+    keep_sum(i, add_slots(segments[visible_id], sum_of(i)));
 }

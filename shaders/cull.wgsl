@@ -1,4 +1,6 @@
-//@ import frame, gaussian, projection
+//@ import frame, gaussian, projection, reach
+//@ variant cull reach=reach_splat
+//@ variant cull_disks reach=outline+reach_disk
 // Marks the Gaussians that a view may see.
 //
 // The test bounds the projected box without a covariance. The standard deviation of a splat in pixels is at
@@ -24,7 +26,7 @@ fn may_be_seen(i: u32) -> bool {
     let m = to_camera(frame, mean_opacity.xyz);
     let opacity = sigmoid(mean_opacity.w);
     let norm2 = dot(quat, quat);
-    var max_scale = exp(max(log_scale.x, max(log_scale.y, log_scale.z)));
+    var max_scale = exp(largest_of(log_scale));
     if veiled(frame.mip_filter, arrayLength(&flags)) != 0u {
         max_scale = length(vec2<f32>(max_scale, density_sums[min(i, arrayLength(&density_sums) - 1u)].z));
     }
@@ -33,11 +35,7 @@ fn may_be_seen(i: u32) -> bool {
     if !(finite && m.z > NEAR && opacity >= MIN_ALPHA && norm2 > 0.0) {
         return false;
     }
-    let ratio = clamp(m.xy / m.z, frame.ratio_min, frame.ratio_max);
-    let deviations = sqrt(2.0 * max(log(255.0 * opacity), 0.0));
-    // Slack of 1 % and half a pixel: this test may pass too many Gaussians, never too few.
-    let spread = 1.01 * sqrt(1.0 + dot(ratio, ratio)) * max_scale / m.z;
-    let reach = deviations * (frame.focal * spread + vec2<f32>(sqrt(BLUR))) + vec2<f32>(0.5);
+    let reach = reach_of(frame, m, max_scale, sqrt(2.0 * max(log(255.0 * opacity), 0.0)));
     let mean2d = frame.focal * m.xy / m.z + frame.principal;
     return all(mean2d + reach > frame.rect_min) && all(mean2d - reach < frame.rect_max);
 }

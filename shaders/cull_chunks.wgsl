@@ -1,4 +1,6 @@
-//@ import frame, gaussian
+//@ import frame, gaussian, chunks
+//@ variant cull_chunks chunks=chunks_splat
+//@ variant cull_disk_chunks chunks=chunks_disk
 // Which chunks of a frozen block may be visible, from the bounding box of each (core/src/gpu/bounds.rs).
 //
 // A Gaussian at camera position m with reach R passes the test of `cull` at an edge of the image only if
@@ -16,12 +18,6 @@
 @group(0) @binding(2) var<storage, read> bounds: array<vec4<f32>>;
 @group(0) @binding(3) var<storage, read_write> chunk_seen: array<u32>;
 
-// The maximum of a . m + c over the box, with slack for rounding.
-fn greatest(a: vec3<f32>, c: f32, centre: vec3<f32>, half_sides: vec3<f32>) -> f32 {
-    let size = dot(abs(a), abs(centre) + half_sides) + abs(c);
-    return dot(a, centre) + c + dot(abs(a), half_sides) + 1e-5 * size;
-}
-
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
         @builtin(local_invocation_index) lane: u32) {
@@ -32,22 +28,5 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let centre = bounds[2u * chunk].xyz;
     let reach = bounds[2u * chunk].w;
     let half_sides = bounds[2u * chunk + 1u].xyz;
-    let most = max(abs(frame.ratio_min), abs(frame.ratio_max));
-    let spread = 1.02 * sqrt(1.0 + dot(most, most)) * reach;
-    // sqrt(2 ln 255) standard deviations of the low-pass.
-    let pad = 3.4 * sqrt(BLUR) + 0.6;
-    let x = frame.view_x;
-    let y = frame.view_y;
-    let z = frame.view_z;
-    // Distance of the principal point from the edges, pixels.
-    let before = frame.principal - frame.rect_min + pad;
-    let behind = frame.rect_max - frame.principal + pad;
-    let f = frame.focal;
-    let seen = reach >= 0.0
-        && greatest(z.xyz, z.w - NEAR, centre, half_sides) > 0.0
-        && greatest(f.x * x.xyz + before.x * z.xyz, f.x * (x.w + spread) + before.x * z.w, centre, half_sides) > 0.0
-        && greatest(f.y * y.xyz + before.y * z.xyz, f.y * (y.w + spread) + before.y * z.w, centre, half_sides) > 0.0
-        && greatest(behind.x * z.xyz - f.x * x.xyz, f.x * (spread - x.w) + behind.x * z.w, centre, half_sides) > 0.0
-        && greatest(behind.y * z.xyz - f.y * y.xyz, f.y * (spread - y.w) + behind.y * z.w, centre, half_sides) > 0.0;
-    chunk_seen[chunk] = select(0u, 1u, seen);
+    chunk_seen[chunk] = select(0u, 1u, reach >= 0.0 && may_hold_seen(centre, half_sides, reach));
 }

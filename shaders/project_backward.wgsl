@@ -1,8 +1,20 @@
-//@ import frame, counters, gaussian, projection, harmonics, water, random, splat, adam, gather, moments
-//@ variant project_backward gather=gather_slots+gradient_of_slots moments=moments_compact
-//@ variant project_backward_f32 gather=gather_slots+gradient_of_slots moments=moments_f32
-//@ variant project_backward_bands gather=gradient_of_bands moments=moments_compact
-//@ variant project_backward_bands_f32 gather=gradient_of_bands moments=moments_f32
+//@ import frame, counters, gaussian, projection, harmonics, water, random, shape, adam, gather, moments
+//@ variant project_backward shape=splat+pull_splat moments=moments_compact
+//@ variant project_backward gather=splat_rows+gather_slots+gradient_of_slots
+//@ variant project_backward_f32 shape=splat+pull_splat moments=moments_f32
+//@ variant project_backward_f32 gather=splat_rows+gather_slots+gradient_of_slots
+//@ variant project_backward_bands shape=splat+pull_splat moments=moments_compact
+//@ variant project_backward_bands gather=splat_sums+gradient_of_bands
+//@ variant project_backward_bands_f32 shape=splat+pull_splat moments=moments_f32
+//@ variant project_backward_bands_f32 gather=splat_sums+gradient_of_bands
+//@ variant project_disks_backward shape=disk+outline+pull_disk moments=moments_compact
+//@ variant project_disks_backward gather=disk_rows+gather_slots+gradient_of_slots
+//@ variant project_disks_backward_f32 shape=disk+outline+pull_disk moments=moments_f32
+//@ variant project_disks_backward_f32 gather=disk_rows+gather_slots+gradient_of_slots
+//@ variant project_disks_backward_bands shape=disk+outline+pull_disk moments=moments_compact
+//@ variant project_disks_backward_bands gather=disk_sums+gradient_of_bands
+//@ variant project_disks_backward_bands_f32 shape=disk+outline+pull_disk moments=moments_f32
+//@ variant project_disks_backward_bands_f32 gather=disk_sums+gradient_of_bands
 // From the gradients of the splats to updated Gaussians: backward projection and Adam in one step.
 //
 // Gradients of parameters are never stored. One thread per visible Gaussian of the block. It sums the
@@ -73,14 +85,12 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     if i == NONE {
         return;
     }
-    let g0 = gathered.sum.a;
-    let g1 = gathered.sum.b;
-    let g2 = gathered.sum.c;
+    let sum = gathered.sum;
     let gradients_only = keeps_gradients();
     // The Gaussian is hidden, or only visible in pixels that do not count. The weights alone would be a
     // gradient too, and Adam would scale it to full size: Gaussians that other views need would fade and
     // scatter.
-    if !gradients_only && all(g2.xyz == vec3<f32>(0.0)) && g1.z == 0.0 && g1.w == 0.0 {
+    if !gradients_only && is_untouched(sum) {
         return;
     }
 
@@ -92,98 +102,14 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let quat = t1 / quat_norm;
     let rot = rotation(quat);
     let bare_scales = exp(t2.xyz);
-    var scales = bare_scales;
     // Sums of density control, and smoothing; see the end.
     let seen = density_sums[i];
-    // Ratio of the scales before and after the 3D filter of Mip-Splatting.
-    var shares = vec3<f32>(1.0);
-    if seen.z > 0.0 {
-        scales = widened(bare_scales, seen.z);
-        shares = bare_scales / scales;
-    }
-    let p = project(frame, mean, rot, scales);
     let opacity = sigmoid(t0.w);
-    let m = p.centre;
-    let inv_z = 1.0 / m.z;
-
-    // Opacity of the splat: opacity times the shares, and times r if the 2D filter is on.
-    let share = shares.x * shares.y * shares.z;
-    var v_logit = g1.y * share * opacity * (1.0 - opacity);
-    // Gradient w.r.t. the logarithm of the factor on opacity.
-    var v_log_factor = g1.y * share * opacity;
-
-    // Conic to covariance: dL/dS = -C G C with C the conic and G its gradient as a symmetric matrix.
-    let det = p.cov.x * p.cov.z - p.cov.y * p.cov.y;
-    let a = p.cov.z / det;
-    let b = -p.cov.y / det;
-    let c = p.cov.x / det;
-    let ga = g0.z;
-    let gb = 0.5 * g0.w;
-    let gc = g1.x;
-    // Rows of G C, then of C (G C).
-    let h00 = ga * a + gb * b;
-    let h01 = ga * b + gb * c;
-    let h10 = gb * a + gc * b;
-    let h11 = gb * b + gc * c;
-    let v_xx = -(a * h00 + b * h10);
-    let v_xy = -(a * h01 + b * h11);
-    let v_yy = -(b * h01 + c * h11);
-
-    // cov2d = A A^T + blur: dL/dA = 2 V A.
-    var v_ax = 2.0 * (v_xx * p.a_x + v_xy * p.a_y);
-    var v_ay = 2.0 * (v_xy * p.a_x + v_yy * p.a_y);
-    if veiled(frame.mip_filter, arrayLength(&flags)) != 0u {
-        // Opacity times r = |n| / sqrt(det) with n = a_x x a_y: dr/dn = n / |n| / sqrt(det), dr/d cov2d =
-        // -r/2 C.
-        let normal = cross(p.a_x, p.a_y);
-        let area = length(normal);
-        let v_r = v_log_factor;
-        let r = area / sqrt(det);
-        let v_normal = (v_r / sqrt(det) / max(area, 1e-30)) * normal;
-        v_ax += cross(p.a_y, v_normal) - (v_r * r) * (a * p.a_x + b * p.a_y);
-        v_ay += cross(v_normal, p.a_x) - (v_r * r) * (b * p.a_x + c * p.a_y);
-        v_logit *= r;
-        v_log_factor *= r;
-    }
-    // A = T R S, rows. M = R S: dL/dM = T^T dL/dA (entry [row of world][column of axis]); dL/dT = dL/dA M^T.
-    let v_tx = rot * (v_ax * scales);
-    let v_ty = rot * (v_ay * scales);
-    // Columns of dL/dM.
-    let v_m0 = p.t_x * v_ax.x + p.t_y * v_ay.x;
-    let v_m1 = p.t_x * v_ax.y + p.t_y * v_ay.y;
-    let v_m2 = p.t_x * v_ax.z + p.t_y * v_ay.z;
-    var v_log_scale = scales * vec3<f32>(dot(v_m0, rot[0]), dot(v_m1, rot[1]), dot(v_m2, rot[2]));
-    if seen.z > 0.0 {
-        let inner = shares * shares;
-        v_log_scale = v_log_scale * inner + v_log_factor * (1.0 - inner);
-    }
-    let r0 = v_m0 * scales.x;
-    let r1 = v_m1 * scales.y;
-    let r2 = v_m2 * scales.z;
-    // Columns r0, r1, r2 of dL/dR; entry R[row][col] = r_col[row].
-    let w = quat.x; let x = quat.y; let y = quat.z; let z = quat.w;
-    let v_unit = 2.0 * vec4<f32>(
-        x * (r1.z - r2.y) + y * (r2.x - r0.z) + z * (r0.y - r1.x),
-        -2.0 * x * (r1.y + r2.z) + y * (r0.y + r1.x) + z * (r0.z + r2.x) + w * (r1.z - r2.y),
-        x * (r0.y + r1.x) - 2.0 * y * (r0.x + r2.z) + z * (r1.z + r2.y) + w * (r2.x - r0.z),
-        x * (r0.z + r2.x) + y * (r1.z + r2.y) - 2.0 * z * (r0.x + r1.y) + w * (r0.y - r1.x),
-    );
-    let v_quat = (v_unit - quat * dot(v_unit, quat)) / quat_norm;
-
-    // T = J W: t_x = fx/z (W_x - u W_z), t_y = fy/z (W_y - v W_z).
-    let v_u = -frame.focal.x * inv_z * dot(v_tx, frame.view_z.xyz);
-    let v_v = -frame.focal.y * inv_z * dot(v_ty, frame.view_z.xyz);
-    var v_centre = vec3<f32>(0.0);
-    v_centre.z = -inv_z * (dot(v_tx, p.t_x) + dot(v_ty, p.t_y));
-    // u = x/z unless clamped.
-    let v_ratio = p.free * vec2<f32>(v_u, v_v);
-    v_centre += inv_z * vec3<f32>(v_ratio, -dot(v_ratio, m.xy) * inv_z);
-    // mean2d = f x/z + principal point.
-    let v_mean2d = frame.focal * g0.xy;
-    v_centre += inv_z * vec3<f32>(v_mean2d, -dot(v_mean2d, m.xy) * inv_z);
-    // range = |centre|.
-    v_centre += (g1.z / length(m)) * m;
-    var v_mean = v_centre.x * frame.view_x.xyz + v_centre.y * frame.view_y.xyz + v_centre.z * frame.view_z.xyz;
+    let pulled = pull(sum, mean, quat, rot, bare_scales, seen.z, opacity);
+    let v_quat = pulled.v_quat / quat_norm;
+    var v_mean = pulled.v_mean;
+    var v_logit = pulled.v_logit;
+    var v_log_scale = pulled.v_log_scale;
 
     // Colour = max(0, 0.5 + sum of coefficient * basis(direction)).
     let offset = mean - frame.eye;
@@ -201,7 +127,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         let k = basis_vec(basis_values, g);
         rgb += k.x * v0.xyz + k.y * vec3<f32>(v0.w, v1.xy) + k.z * vec3<f32>(v1.zw, v2.x) + k.w * v2.yzw;
     }
-    var v_blended = g2.xyz;
+    var v_blended = colour_gradient(sum);
     // Factor on the rate of the constant colour, so that the seen colour moves as fast as in air. It does not
     // apply to the higher bands: they would fit the noise of a photograph as view dependence, several times
     // over. Their rate differs only in clear water (water.clear_harmonics), through step.sh_rest_lr.
@@ -286,7 +212,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         weight += step.floater_weight;
     }
     v_logit += weight / visible * opacity * (1.0 - opacity);
-    v_log_scale += step.scale_reg / (3.0 * visible) * bare_scales;
+    v_log_scale += step.scale_reg / (3.0 * visible) * bare_scales * HAS_SCALE;
 
     var new0 = t0 - transform_step(i, 0u, vec4<f32>(v_mean, v_logit), rates.xxxw, pace);
     let new1 = t1 - transform_step(i, 1u, v_quat, rates.yyyy, pace);
@@ -314,8 +240,8 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     // For density control: sum of the pixel gradient, visits, the smoothing (smoothing.wgsl), and the sum of
     // the gradient w.r.t. the centre. The last is in units of half an image, as in 3DGS, whose pixel
     // coordinates run from -1 to 1.
-    let by_centre = length(0.5 * vec2<f32>(frame.size) * g0.xy);
-    density_sums[i] = vec4<f32>(seen.x + g1.w, seen.y + 1.0, seen.z, seen.w + by_centre);
+    let by_centre = length(0.5 * vec2<f32>(frame.size) * centre_gradient(sum));
+    density_sums[i] = vec4<f32>(seen.x + gradient_on_image(sum), seen.y + 1.0, seen.z, seen.w + by_centre);
 }
 
 fn add_weights(weights: ptr<function, Basis>, g: u32, own: vec4<f32>) {

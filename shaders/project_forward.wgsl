@@ -1,5 +1,8 @@
-//@ import frame, gaussian, projection, harmonics, colour, water
-// Projects the visible Gaussians of one block into the view (Zwicker et al. 2002; Kerbl et al. 2023).
+//@ import frame, gaussian, projection, shape, harmonics, colour, water
+//@ variant project_forward shape=shape_splat
+//@ variant project_disks shape=outline+shape_disk
+// Projects the visible Gaussians of one block into the view (Zwicker et al. 2002; Kerbl et al. 2023). They
+// are 3D Gaussians, or disks that are also written in the camera's frame (shape_*.wgsl).
 //
 //   projected             [visible*3]  vec4: (mean2d xy, conic a, b), (conic c, opacity, range, E), (rgb, 0)
 //                                      pixels, 1/pixel^2, scene units
@@ -9,7 +12,7 @@
 //   depth_keys            [visible]    bits of z minus those of NEAR: 30 bits, ordered like z
 //   order                 [visible]    the entry's own index, the value that the depth sort moves
 //   gaussian_from_visible [visible]    index inside the block
-// One thread per Gaussian of the block. Twin: core/twins/src/project_forward.rs
+// One thread per Gaussian of the block. Twins: core/twins/src/project_forward.rs, core/twins/src/disks.rs
 
 @group(0) @binding(0) var<uniform> frame: Frame;
 @group(0) @binding(1) var<uniform> block: Block;
@@ -21,8 +24,6 @@
 @group(0) @binding(7) var<storage, read_write> depth_keys: array<u32>;
 @group(0) @binding(8) var<storage, read_write> order: array<u32>;
 @group(0) @binding(9) var<storage, read_write> gaussian_from_visible: array<u32>;
-// z: smoothing; frozen blocks have a single row of zeros.
-@group(0) @binding(10) var<storage, read> density_sums: array<vec4<f32>>;
 @group(0) @binding(11) var<uniform> water: Water;
 
 @compute @workgroup_size(64)
@@ -44,29 +45,9 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     }
     let mean_opacity = transforms[3u * i];
     let quat = normalize(transforms[3u * i + 1u]);
-    var scales = exp(transforms[3u * i + 2u].xyz);
-    var opacity = sigmoid(mean_opacity.w);
-    let filtered = veiled(frame.mip_filter, arrayLength(&flags)) != 0u;
-    if filtered {
-        let smoothing = density_sums[min(i, arrayLength(&density_sums) - 1u)].z;
-        if smoothing > 0.0 {
-            let wide = widened(scales, smoothing);
-            let shares = scales / wide;
-            opacity *= shares.x * shares.y * shares.z;
-            scales = wide;
-        }
-    }
-    let p = project(frame, mean_opacity.xyz, rotation(quat), scales);
-    let mean2d = frame.focal * p.centre.xy / p.centre.z + frame.principal;
-    let det = p.cov.x * p.cov.z - p.cov.y * p.cov.y;
-    let conic = vec3<f32>(p.cov.z, -p.cov.y, p.cov.x) / det;
-    if filtered {
-        opacity *= compensation(p, det);
-    }
-    var extent = log(255.0 * opacity);
-    // A covariance that overflowed, or cancelled to nothing, touches no tile.
-    if !(det > 0.0 && is_finite(det) && is_finite(conic.x) && is_finite(conic.y) && is_finite(conic.z)
-        && is_finite(mean2d.x) && is_finite(mean2d.y)) {
+    let shape = shape_of(i, visible_id, mean_opacity.xyz, sigmoid(mean_opacity.w), quat, transforms[3u * i + 2u].xyz);
+    var extent = log(255.0 * shape.opacity);
+    if !shape.is_sound {
         extent = -1.0;
     }
     let rgb = colour(i, normalize(mean_opacity.xyz - frame.eye));
@@ -74,15 +55,15 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     if !(is_finite(rgb.x) && is_finite(rgb.y) && is_finite(rgb.z)) {
         extent = -1.0;
     }
-    projected[3u * visible_id] = vec4<f32>(mean2d, conic.xy);
-    projected[3u * visible_id + 1u] = vec4<f32>(conic.z, opacity, length(p.centre), extent);
+    projected[3u * visible_id] = vec4<f32>(shape.mean2d, shape.conic.xy);
+    projected[3u * visible_id + 1u] = vec4<f32>(shape.conic.z, shape.opacity, length(shape.centre), extent);
     var blended = max(rgb, vec3<f32>(0.0));
     let medium = veiled(frame.medium, arrayLength(&flags) + 6u);
     if medium != MEDIUM_NONE {
-        blended = in_medium(medium, water, blended, length(p.centre));
+        blended = in_medium(medium, water, blended, length(shape.centre));
     }
     projected[3u * visible_id + 2u] = vec4<f32>(blended, 0.0);
-    depth_keys[visible_id] = min(bitcast<u32>(p.centre.z) - bitcast<u32>(NEAR), 0x3fffffffu);
+    depth_keys[visible_id] = min(bitcast<u32>(shape.centre.z) - bitcast<u32>(NEAR), 0x3fffffffu);
     order[visible_id] = visible_id;
     gaussian_from_visible[visible_id] = i;
 }

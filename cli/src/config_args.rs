@@ -42,8 +42,11 @@ pub struct JobArgs {
     /// Pixels of a mask to keep: white or black [default: white]
     #[arg(long, value_name = "SIDE", value_parser = ["white", "black"])]
     pub mask_keep: Option<String>,
-    /// Preset that all other settings start from: fathom, paper (SMP-UWGS as printed) or 3dgs (no water)
-    /// [default: fathom]
+    /// Method that trains the scene: splats (3D Gaussians) or 2dgs (disks on surfaces) [default: splats]
+    #[arg(long, value_name = "NAME")]
+    pub method: Option<String>,
+    /// Preset that all other settings start from: fathom, paper (SMP-UWGS as printed), 3dgs (no water) or
+    /// 2dgs (disks, no water) [default: fathom]
     #[arg(long, value_name = "NAME")]
     pub preset: Option<String>,
     /// Seed of all random numbers [default: 1]
@@ -95,6 +98,9 @@ impl JobArgs {
                 same_preset(&read_file(path)?, preset, path)?;
             }
             table.insert("preset".to_owned(), Value::String(preset.clone()));
+        }
+        if let Some(method) = &self.method {
+            table.insert("method".to_owned(), Value::String(method.clone()));
         }
         let config = serde_json::to_value(table)
             .and_then(JobConfig::over_its_preset)
@@ -211,7 +217,7 @@ mod tests {
             }
             checked += 1;
         }
-        assert_eq!(checked, 10);
+        assert_eq!(checked, 11);
     }
 
     #[test]

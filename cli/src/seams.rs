@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use fathom_core::config::SeamsConfig;
 use fathom_core::gaussians::Gaussians;
-use fathom_core::gpu::{Gpu, SeamRun};
+use fathom_core::gpu::{Drawing, Gpu, SeamRun};
 use fathom_plan::Plan;
 use serde_json::Value;
 
@@ -62,14 +62,14 @@ fn beside(model: &Path, name: &str) -> PathBuf {
 pub fn run_of(
     gpu: &Arc<Gpu>,
     model: &Gaussians,
-    mip_filter: bool,
+    drawing: Drawing,
     plan: &Plan,
     config: SeamsConfig,
 ) -> Result<Option<SeamRun>> {
     // As sent to workers.
     let viewing_distance = plan.extent.viewing_distance.map(|distance| distance as f32);
     let Some(lines) = plan.seam_lines(&config) else { return Ok(None) };
-    Ok(SeamRun::if_it_fits(gpu, model, mip_filter, viewing_distance, (lines, config))?)
+    Ok(SeamRun::if_it_fits(gpu, model, drawing, viewing_distance, (lines, config))?)
 }
 
 /// One line about the borders and one about the surface; none if the plan has one cell.

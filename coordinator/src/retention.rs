@@ -2,8 +2,8 @@
 //!
 //! A blob is kept when a row of the store names it, or when a named blob contains its digest as text.
 //! Manifests, plans, indexes and evaluations contain digests. This may keep too much, never too little. When
-//! one of these cannot be read, nothing is removed at all. Pictures of previews are kept as long as the history
-//! of their job names them.
+//! one of these cannot be read, nothing is removed at all. Pictures of previews are kept as long as the
+//! history of their job names them.
 
 use std::collections::{HashMap, HashSet};
 use std::sync::Arc;

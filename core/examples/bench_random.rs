@@ -170,6 +170,7 @@ impl Step {
             v_image: &self.v_image,
             v_range: &self.v_range,
             slot_gradients: &self.slot_gradients,
+            disks: None,
             step: &self.rates,
             appearances: &[],
         };

@@ -30,6 +30,29 @@ pub const INTERSECTION_BYTES: u64 = 68;
 pub const GRADIENT_BYTES: u64 = 48;
 /// Bytes per trained Gaussian for its sums if views are rendered in bands: three vec4.
 pub const BAND_BYTES: u64 = 48;
+/// Bytes per visible disk, beside those of a Gaussian: its three vec4 in the camera's frame.
+pub const DISK_BYTES: u64 = 48;
+/// Bytes per intersection of a disk for its gradient: five vec4.
+pub const DISK_GRADIENT_BYTES: u64 = 80;
+/// Bytes per pixel of disks, beside those of Gaussians: blended normal; in training its gradient, and what
+/// the backward pass needs of the pixel (vec4, and three of them).
+pub const DISK_PIXEL_BYTES: [u64; 2] = [16, 48];
+
+/// Bytes of the gradient of an intersection, and of the sums of bands of a Gaussian.
+pub fn slot_bytes(disks: bool) -> u64 {
+    if disks { DISK_GRADIENT_BYTES } else { GRADIENT_BYTES }
+}
+
+/// Bytes per visible Gaussian or disk.
+pub fn visible_bytes(disks: bool) -> u64 {
+    VISIBLE_BYTES + if disks { DISK_BYTES } else { 0 }
+}
+
+/// Bytes per intersection of a Gaussian or a disk.
+pub fn intersection_bytes(disks: bool) -> u64 {
+    INTERSECTION_BYTES - GRADIENT_BYTES + slot_bytes(disks)
+}
+
 /// Bytes per pixel of the render: colour and alpha (vec4) and range.
 pub const RENDER_BYTES: u64 = 20;
 /// Bytes per pixel of the loss: photograph, three SSIM maps (vec4), gradients of colour (vec4) and of range.
@@ -95,9 +118,10 @@ const LEAST_INTERSECTIONS: u64 = 4096;
 /// Bytes of the longest row in the lists of a view: splats by visible Gaussian, gradients by intersection.
 pub const LONGEST_ROW_BYTES: u64 = 48;
 
-/// Maximum length of the lists of a view for bindings of up to `binding_bytes`.
-pub fn most_rows(binding_bytes: u64) -> u32 {
-    u32::try_from(binding_bytes / LONGEST_ROW_BYTES).unwrap_or(u32::MAX)
+/// Maximum length of the lists of a view for bindings of up to `binding_bytes`, of 3D Gaussians or of disks.
+pub fn most_rows(binding_bytes: u64, disks: bool) -> u32 {
+    let longest = LONGEST_ROW_BYTES.max(slot_bytes(disks));
+    u32::try_from(binding_bytes / longest).unwrap_or(u32::MAX)
 }
 
 /// Bytes per Gaussian for its coefficients: three channels of f32, in groups of four coefficients.
@@ -130,7 +154,8 @@ pub fn trained_bytes(sh_degree: u8, moments: Moments) -> u64 {
 
 /// Bytes per pixel of a training picture during training.
 pub fn pixel_bytes(settings: Settings<'_>) -> u64 {
-    RENDER_BYTES + LOSS_BYTES + appearance::pixel_bytes(settings)
+    let of_disks: u64 = if settings.train.disks { DISK_PIXEL_BYTES.iter().sum() } else { 0 };
+    RENDER_BYTES + LOSS_BYTES + appearance::pixel_bytes(settings) + of_disks
 }
 
 /// Lengths of the lists of a view.
@@ -204,7 +229,7 @@ impl RunSize<'_> {
         let tiles = f64::from(tiles.unwrap_or(1));
         let layers = (LAYERS_AT_LEAST + LAYERS_BY_DENSITY * (visible as f64 / tiles).sqrt()).powi(2);
         let intersections = ((tiles * layers) as u64).min(MOST_TILES * visible).max(LEAST_INTERSECTIONS);
-        let most = u64::from(most_rows(self.binding_bytes));
+        let most = u64::from(most_rows(self.binding_bytes, self.settings.train.disks));
         Lists {
             visible: visible.min(most) as u32,
             intersections: intersections.min(most) as u32,
@@ -215,8 +240,8 @@ impl RunSize<'_> {
     /// Bytes per trained Gaussian without its flag: [`trained_bytes`], plus sums if views are rendered in
     /// bands.
     pub fn trained_bytes(&self) -> u64 {
-        let bands = if self.lists().in_bands { BAND_BYTES } else { 0 };
         let config = self.settings.train;
+        let bands = if self.lists().in_bands { slot_bytes(config.disks) } else { 0 };
         trained_bytes(config.sh_degree, config.moments) + bands
     }
 
@@ -239,15 +264,17 @@ impl RunSize<'_> {
         let read_back = self.trained.min(block_capacity(config.moments).into())
             * of_colour.max(transform_moment_bytes(config.moments));
         let uploaded = (photograph * views.min(BATCH.into())).min(STAGED_BYTES.max(photograph));
+        let disks = config.disks;
+        let of_disks = if disks { DISK_PIXEL_BYTES[0] } else { 0 };
         let copy = self.trained * (frozen_bytes + FLAG_BYTES)
-            + visible * VISIBLE_BYTES
+            + visible * visible_bytes(disks)
             + intersections * (INTERSECTION_BYTES - GRADIENT_BYTES)
-            + pixels * RENDER_BYTES
+            + pixels * (RENDER_BYTES + of_disks)
             + (self.trained * frozen_bytes).min(STAGED_BYTES);
         MemoryForecast {
             gaussians: self.trained * self.trained_bytes() + self.frozen * frozen_bytes + all * FLAG_BYTES,
-            per_visible: visible * VISIBLE_BYTES,
-            per_intersection: intersections * INTERSECTION_BYTES,
+            per_visible: visible * visible_bytes(disks),
+            per_intersection: intersections * intersection_bytes(disks),
             pixels: pixels * pixel_bytes(self.settings),
             photographs: self.photographs(),
             transfers: read_back.max(uploaded),

@@ -98,7 +98,8 @@ pub trait Run {
 /// When there are no views, nothing to train, or the device cannot hold the run.
 pub fn start(method: Method, gpu: Arc<Gpu>, run: TrainRun) -> Result<Box<dyn Run>> {
     match method {
-        Method::Splats => Ok(Box::new(Trainer::new(gpu, run)?)),
+        // The configuration of the run says which of the two it is.
+        Method::Splats | Method::Disks => Ok(Box::new(Trainer::new(gpu, run)?)),
     }
 }
 

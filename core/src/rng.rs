@@ -26,6 +26,8 @@ pub enum Stream {
     Film = 9,
     /// Which views an epoch has if views are weighted.
     ViewSample = 10,
+    /// Directions of disks at the start.
+    Turn = 11,
 }
 
 /// 32 random bits for (seed, stream, a, b): PCG3D of Jarzynski and Olano (JCGT 2020), two rounds.

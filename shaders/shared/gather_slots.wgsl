@@ -1,5 +1,5 @@
-// The gradient of a visible Gaussian from its slots. Needs frame, counters, gaussian, splat and the names
-// block, counters, flags.
+// The gradient of a visible Gaussian from its slots. Needs frame, counters, gaussian, splat or disk,
+// their rows, and the names block, counters, flags.
 
 @group(0) @binding(5) var<storage, read> gaussian_from_visible: array<u32>;
 @group(0) @binding(6) var<storage, read> segments: array<vec2<u32>>;
@@ -21,9 +21,7 @@ const NONE: u32 = 0xffffffffu;
 fn add_slots(segment: vec2<u32>, start: Splat) -> Splat {
     var sum = start;
     for (var s = segment.x; s < segment.x + segment.y; s++) {
-        sum.a += slot_gradients[3u * s];
-        sum.b += slot_gradients[3u * s + 1u];
-        sum.c += slot_gradients[3u * s + 2u];
+        sum = added(sum, s);
     }
     return sum;
 }

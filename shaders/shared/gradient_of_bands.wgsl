@@ -1,6 +1,6 @@
 // Input of project_backward when the image is rendered in bands: one thread per Gaussian of the block, and
 // the sums that add_band_gradients wrote. Flags and counters are those of the whole image. Needs frame,
-// counters, gaussian, splat.
+// counters, gaussian, splat_sums or disk_sums.
 
 @group(0) @binding(5) var<storage, read> band_gradients: array<vec4<f32>>;
 
@@ -14,8 +14,7 @@ struct Gathered {
 fn gather(thread: u32) -> Gathered {
     // If a band overflowed, the sums are incomplete.
     if thread >= block.count || counters[OVERFLOW] != 0u {
-        return Gathered(NONE, Splat(vec4<f32>(0.0), vec4<f32>(0.0), vec4<f32>(0.0)));
+        return Gathered(NONE, NOTHING);
     }
-    let at = 3u * thread;
-    return Gathered(thread, Splat(band_gradients[at], band_gradients[at + 1u], band_gradients[at + 2u]));
+    return Gathered(thread, sum_of(thread));
 }

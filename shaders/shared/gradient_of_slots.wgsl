@@ -8,14 +8,13 @@ struct Gathered {
 }
 
 fn gather(thread: u32) -> Gathered {
-    let zero = Splat(vec4<f32>(0.0), vec4<f32>(0.0), vec4<f32>(0.0));
     let visible_id = visible_of_thread(thread);
     if visible_id == NONE {
-        return Gathered(NONE, zero);
+        return Gathered(NONE, NOTHING);
     }
     let segment = segments[visible_id];
     if segment.y == 0u {
-        return Gathered(NONE, zero);
+        return Gathered(NONE, NOTHING);
     }
-    return Gathered(gaussian_from_visible[visible_id], add_slots(segment, zero));
+    return Gathered(gaussian_from_visible[visible_id], add_slots(segment, NOTHING));
 }

@@ -9,3 +9,5 @@ struct Splat {
     b: vec4<f32>,
     c: vec4<f32>,
 }
+
+const NOTHING: Splat = Splat(vec4<f32>(0.0), vec4<f32>(0.0), vec4<f32>(0.0));

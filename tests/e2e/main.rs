@@ -7,6 +7,7 @@ mod access;
 mod command_line;
 mod datasets;
 mod direct;
+mod disks;
 mod drivers;
 #[cfg(unix)]
 mod faults;

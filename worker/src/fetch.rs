@@ -35,7 +35,7 @@ impl Fetch<'_> {
     pub async fn everything(&self, assignment: &v1::Assignment) -> Result<TaskInput, TaskError> {
         let manifest = self.read(&assignment.manifest, "manifest").await?;
         let manifest = Manifest::from_json(&manifest).map_err(|e| TaskError::protocol(e.to_string()))?;
-        let config = serde_json::from_str(&assignment.config_json).map_err(|e| {
+        let config = JobConfig::from_json(&assignment.config_json).map_err(|e| {
             let message = format!("the job's configuration: {e}; use the same version on all machines");
             TaskError::Failed { class: v1::FailClass::Environment, message }
         })?;

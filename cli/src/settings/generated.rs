@@ -32,7 +32,7 @@ code, and a test fails when it is out of date.
 4. the flags of common settings, which `fathom train --help` lists
 
 Unknown keys are refused. `deploy/job.example.toml` holds every key with its default. Each result stores its
-settings in `OUT/run.json`. Values of the presets `paper` and `3dgs` are listed where they differ from
+settings in `OUT/run.json`. Values of the presets `paper`, `3dgs` and `2dgs` are listed where they differ from
 the default. [Papers](../papers.md) has the sources in full.
 
 A share is a number from 0 to 1. A share of the run counts in iterations of the run. Learning rates are
@@ -60,7 +60,7 @@ struct JobSetting {
     key: String,
     unit: String,
     default: Value,
-    /// Its values in `paper` and `3dgs`, where they differ from the default.
+    /// Its values in the other presets, where they differ from the default.
     others: Vec<(&'static str, Value)>,
     meaning: String,
     source: String,
@@ -90,6 +90,7 @@ fn job_sections() -> Vec<Section> {
         ("", json(&JobConfig::default())),
         ("paper", json(&JobConfig::of_preset(Preset::Paper))),
         ("3dgs", json(&JobConfig::of_preset(Preset::Splatting))),
+        ("2dgs", json(&JobConfig::of_preset(Preset::Disks))),
     ];
     let mut sections = Vec::new();
     add_section(&source, "JobConfig", "", &presets, &mut sections);

@@ -170,15 +170,14 @@ fn measure(args: &EvalArgs) -> Result<Value> {
     let adapter = gpu.adapter().name.clone();
     let water = fathom_core::ply::water_record(&path)?;
     let through = |output| water.as_ref().map(|record| WaterView::of_record(record, output));
-    let mip_filter = fathom_core::ply::is_antialiased(&path)?;
-    let mut renderer = Renderer::new(Arc::clone(&gpu), &gaussians)?
-        .with_mip_filter(mip_filter)
-        .with_water(through(Output::Underwater));
+    let drawing = fathom_core::ply::drawing(&path)?;
+    let mut renderer =
+        Renderer::new(Arc::clone(&gpu), &gaussians)?.drawn(drawing)?.with_water(through(Output::Underwater));
     let mut seams = match seams::plan_of(&args.model, args.plan.as_deref())? {
         Some(plan) => seams::run_of(
             &gpu,
             &gaussians,
-            mip_filter,
+            drawing,
             &plan,
             seams::config_of(&args.model, args.plan.as_deref())?,
         )?,

@@ -220,7 +220,7 @@ fn white_point_of(args: &ExportArgs, path: &Path) -> Result<Option<WhitePoint>> 
     let shots: Vec<_> = views.iter().map(|view| (view.name.as_str(), &view.camera, &view.pose)).collect();
     let found = || -> Result<Option<WhitePoint>> {
         let mut renderer = Renderer::new(args.gpu.open()?, &model::load(path)?)?
-            .with_mip_filter(ply::is_antialiased(path)?)
+            .drawn(ply::drawing(path)?)?
             .with_water(record.map(|record| WaterView::of_record(&record, Output::Restored)));
         args.white_point
             .find(&shots, |camera, pose| renderer.render(camera, pose, [0.0; 3]).map_err(Into::into))
@@ -248,7 +248,7 @@ fn for_viewers(args: &ExportArgs, to: &Path, path: &Path, white: Option<&WhitePo
                 path.display()
             ))
         })?;
-    if ply::is_antialiased(path)? {
+    if ply::drawing(path)?.mip_filter {
         return Err(CliError::Message(format!(
             "{} was trained with train.mip_filter, and its smoothing would be applied twice; --export-colour \
              viewer is for models without it",

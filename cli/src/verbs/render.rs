@@ -166,7 +166,7 @@ fn render(args: RenderArgs) -> Result<()> {
         refuse_later_frames(&args.output, &shots)?;
     }
     let mut renderer = Renderer::new(args.gpu.open()?, &model)?
-        .with_mip_filter(fathom_core::ply::is_antialiased(&path)?)
+        .drawn(fathom_core::ply::drawing(&path)?)?
         .with_water(args.water_view(&path)?);
     let named: Vec<_> = shots.iter().map(|shot| (shot.name.as_str(), &shot.camera, &shot.pose)).collect();
     let white = args

@@ -28,10 +28,10 @@ pub struct SynthArgs {
     #[arg(long, value_enum)]
     water: Option<Switch>,
     /// Depth of a pool, metres [default: 0.8]
-    #[arg(long, value_name = "METRES")]
+    #[arg(long, value_name = "METRES", allow_negative_numbers = true)]
     depth: Option<f64>,
     /// Refractive index of the water of a pool [default: 1.333]
-    #[arg(long, value_name = "INDEX")]
+    #[arg(long, value_name = "INDEX", allow_negative_numbers = true)]
     ior: Option<f64>,
     /// Seed of textures, debris, camera path and noise
     #[arg(long, default_value_t = SynthOptions::default().seed)]

@@ -9,8 +9,8 @@ use fathom_core::appearance::Settings;
 use fathom_core::config::{JobConfig, TrainConfig, WaterConfig};
 use fathom_core::duration;
 use fathom_core::memory::{
-    COMMON_BINDING_BYTES, FLAG_BYTES, INTERSECTION_BYTES, RunSize, SMALLEST_TILE, VISIBLE_BYTES,
-    frozen_bytes, pixel_bytes, visible_in_views,
+    COMMON_BINDING_BYTES, FLAG_BYTES, RunSize, SMALLEST_TILE, frozen_bytes, intersection_bytes, pixel_bytes,
+    visible_bytes, visible_in_views,
 };
 use fathom_core::scene::{PinholeCamera, Pose};
 use glam::DVec3;
@@ -100,13 +100,14 @@ pub fn forecast(
     let trained_bytes = run.trained_bytes() + FLAG_BYTES;
     let lists = run.lists();
     let pixel_bytes = pixel_bytes(settings);
+    let [visible_bytes, intersection_bytes] = [visible_bytes, intersection_bytes].map(|of| of(config.disks));
     Forecast {
         seconds: duration::seconds(config, &pictures, trained.1 + frozen.1, seen.mean),
         bytes: parts.total(),
         parts,
         formula: format!(
             "{} trained Gaussians x {trained_bytes} B + {} frozen x {frozen_bytes} B \
-             + {} visible x {VISIBLE_BYTES} B + {} intersections x {INTERSECTION_BYTES} B \
+             + {} visible x {visible_bytes} B + {} intersections x {intersection_bytes} B \
              + {} pixels x {pixel_bytes} B + photographs {} B + transfers {} B + measuring {} B",
             trained.1,
             frozen.1,

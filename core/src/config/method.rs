@@ -9,16 +9,20 @@ pub enum Method {
     /// 3D Gaussian splats, with or without a medium: every preset.
     #[default]
     Splats,
+    /// 2D Gaussians: disks on surfaces (2DGS, Huang et al. 2024).
+    #[serde(rename = "2dgs")]
+    Disks,
 }
 
 impl Method {
     /// Every method of this program.
-    pub const ALL: [Self; 1] = [Self::Splats];
+    pub const ALL: [Self; 2] = [Self::Splats, Self::Disks];
 
     /// Its name in configurations.
     pub fn name(self) -> &'static str {
         match self {
             Self::Splats => "splats",
+            Self::Disks => "2dgs",
         }
     }
 }

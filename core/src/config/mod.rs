@@ -53,6 +53,9 @@ pub enum Preset {
     /// Plain 3D Gaussian splatting without a medium, in sRGB: the control.
     #[serde(rename = "3dgs")]
     Splatting,
+    /// 2D Gaussian splatting (disks) without a medium, in sRGB: surfaces that are nearer to the truth.
+    #[serde(rename = "2dgs")]
+    Disks,
 }
 
 /// Everything except the input that determines the result of a job.
@@ -61,7 +64,8 @@ pub enum Preset {
 pub struct JobConfig {
     /// Starting point of all other values.
     pub preset: Preset,
-    /// Method that trains the scene. Default `splats`, the only method.
+    /// Method that trains the scene: `splats` (3D Gaussians) or `2dgs` (2D Gaussians: disks on surfaces).
+    /// Default `splats`.
     pub method: Method,
     /// Photographs: sizes, held-out views, masks.
     pub data: DataConfig,
@@ -85,9 +89,16 @@ impl JobConfig {
         let water = match preset {
             Preset::Fathom => WaterConfig::default(),
             Preset::Paper => WaterConfig::paper(),
-            Preset::Splatting => WaterConfig::none(),
+            Preset::Splatting | Preset::Disks => WaterConfig::none(),
         };
-        Self { preset, water, ..Self::default() }
+        let method = if preset == Preset::Disks { Method::Disks } else { Method::default() };
+        Self { preset, method, water, ..Self::default() }.with_shape()
+    }
+
+    /// Sets what the method says about its Gaussians.
+    fn with_shape(mut self) -> Self {
+        self.train.disks = self.method == Method::Disks;
+        self
     }
 
     /// A configuration from JSON. Missing values are those of its preset.
@@ -111,7 +122,7 @@ impl JobConfig {
         numbers::refuse_huge(&given, "").map_err(serde::de::Error::custom)?;
         let mut merged = serde_json::to_value(Self::of_preset(Named::deserialize(&given)?.preset))?;
         overlay(&mut merged, given);
-        serde_json::from_value(merged)
+        serde_json::from_value(merged).map(Self::with_shape)
     }
 }
 
@@ -268,6 +279,18 @@ impl JobConfig {
         require(
             p.columns.saturating_mul(p.rows) <= 4096,
             "partition.columns * partition.rows must be at most 4096",
+        );
+        require(
+            self.method != Method::Disks || !t.mip_filter,
+            "method = \"2dgs\" has a low-pass of its own; train.mip_filter must be false",
+        );
+        require(
+            self.method != Method::Disks || self.water.medium != Medium::PerGaussian,
+            "method = \"2dgs\" blends disks before the water acts; water.medium must be \"none\" or \"per_pixel\"",
+        );
+        require(
+            (0.0..=10.0).contains(&t.normal_consistency) && (0.0..=1.0).contains(&t.normal_consistency_from),
+            "train.normal_consistency must be from 0 to 10, and normal_consistency_from a share of the run",
         );
         p.validate_cut(&mut require);
         require((0.0..=10.0).contains(&p.extend_base), "partition.extend_base must be between 0 and 10");

@@ -2,6 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::gpu::Drawing;
+
 /// Storage of Adam's moments on the device.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -164,6 +166,11 @@ pub struct TrainConfig {
     /// is that of the antialiased modes of gsplat and of viewers; the paper has 0.1. A comment in the PLY
     /// records this filter. Other viewers show the model as trained when antialiasing is on.
     pub mip_filter: bool,
+    /// Weight of the normal consistency of disks: the blended normal of a pixel against the normal of its
+    /// expected range (2DGS, Huang et al. 2024, eq. 14). Default 0.05 (2DGS). Only with `method = 2dgs`.
+    pub normal_consistency: f32,
+    /// Share of the run from which it counts. Default 0.25 (2DGS: 7000 of 30,000).
+    pub normal_consistency_from: f32,
     /// Storage of Adam's moments: `compact` or `f32`. Default compact. BENCHMARKS.md has its cost in quality.
     pub moments: Moments,
     /// Threads that read photographs ahead of use. Default 1. 0 reads each when it is needed. Results are the
@@ -188,6 +195,9 @@ pub struct TrainConfig {
     /// loss_factor`).
     #[serde(skip)]
     pub loss_factor: f32,
+    /// Whether Gaussians are disks. Set by `method`, never by itself.
+    #[serde(skip)]
+    pub disks: bool,
 }
 
 impl Default for TrainConfig {
@@ -222,6 +232,8 @@ impl Default for TrainConfig {
             exposure_lr: 0.01,
             exposure_lr_end: 1e-3,
             mip_filter: false,
+            normal_consistency: 0.05,
+            normal_consistency_from: 0.25,
             moments: Moments::Compact,
             prefetch_threads: 1,
             eval_every: 0,
@@ -230,11 +242,17 @@ impl Default for TrainConfig {
             preview_views: 2,
             classic: ClassicConfig::default(),
             loss_factor: 1.0,
+            disks: false,
         }
     }
 }
 
 impl TrainConfig {
+    /// How its Gaussians are rendered.
+    pub fn drawing(&self) -> Drawing {
+        Drawing { mip_filter: self.mip_filter, disks: self.disks }
+    }
+
     /// How often a picture with a longest side of `side` pixels is halved when the schedule asks for `wanted`
     /// halvings. The result keeps at least 96 pixels.
     pub fn halvings(wanted: u32, side: u32) -> u32 {

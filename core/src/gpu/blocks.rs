@@ -55,15 +55,15 @@ impl BlockTraining {
         vec![(&self.moments, of_transform), (&self.sh_moments, of_colour), (&self.density_sums, 16)]
     }
 
-    /// The sums of bands; allocated at the first call.
+    /// The sums of bands, in rows of this many bytes; allocated at the first call.
     ///
     /// # Errors
     /// When the device cannot hold them.
-    pub fn band_gradients(&self, gpu: &Gpu, capacity: u32) -> Result<&wgpu::Buffer> {
+    pub fn band_gradients(&self, gpu: &Gpu, capacity: u32, row_bytes: u64) -> Result<&wgpu::Buffer> {
         if let Some(buffer) = self.band_gradients.get() {
             return Ok(buffer);
         }
-        let buffer = gpu.buffer("band gradients", u64::from(capacity.max(1)) * 48)?;
+        let buffer = gpu.buffer("band gradients", u64::from(capacity.max(1)) * row_bytes)?;
         Ok(self.band_gradients.get_or_init(|| buffer))
     }
 }

@@ -7,7 +7,7 @@
 //! would exceed the largest binding is rendered in bands of tiles, one after the other.
 
 use super::layout::{DEPTH_BITS, FrameUniform, WaterUniform, counter};
-use super::{Blocks, Gpu, Recorder, Scan, Size, Sort};
+use super::{Block, Blocks, Gpu, Recorder, Scan, Size, Sort};
 use crate::memory::{LONGEST_ROW_BYTES, most_rows};
 use crate::water::Water;
 use crate::{CoreError, Result};
@@ -33,9 +33,14 @@ pub struct ListLimits {
 }
 
 impl ListLimits {
-    /// The limits of the device's bindings.
+    /// The limits of the device's bindings, for 3D Gaussians.
     pub fn of(gpu: &Gpu) -> Self {
-        let rows = most_rows(gpu.largest_binding());
+        Self::of_rows(gpu, false)
+    }
+
+    /// The same, for 3D Gaussians or for disks.
+    pub fn of_rows(gpu: &Gpu, disks: bool) -> Self {
+        let rows = most_rows(gpu.largest_binding(), disks);
         Self { visible: rows, intersections: rows }
     }
 
@@ -73,6 +78,8 @@ pub struct FrameTargets {
     pub image: wgpu::Buffer,
     /// `[H*W]`.
     pub range_image: wgpu::Buffer,
+    /// `[H*W]` vec4 of a frame of disks: blended normal, camera axes, towards the camera.
+    pub normal_image: Option<wgpu::Buffer>,
     /// `[tiles+1]` first and last of the sorted intersections.
     pub ranges: wgpu::Buffer,
     /// `[tiles]`.
@@ -95,6 +102,8 @@ pub struct Frame {
     pub flags: wgpu::Buffer,
     /// `[visible*3]` vec4.
     pub projected: wgpu::Buffer,
+    /// `[visible*3]` vec4 of a frame of disks: disks in the camera's frame ([`Frame::of_disks`]).
+    pub disks: Option<wgpu::Buffer>,
     /// `[visible]`.
     pub gaussian_from_visible: wgpu::Buffer,
     /// `[visible]` (first slot, count).
@@ -133,6 +142,7 @@ impl Frame {
             args: words("indirect arguments", counter::ARGS_BLOCK + MAX_BLOCK_ARGS, 3)?,
             flags: words("visible flags", gaussians, 1)?,
             projected: words("projected", visible, 12)?,
+            disks: None,
             gaussian_from_visible: words("gaussian_from_visible", visible, 1)?,
             segments: words("segments", visible, 2)?,
             visible_from_slot: words("visible_from_slot", intersections, 1)?,
@@ -148,6 +158,17 @@ impl Frame {
             limits: ListLimits::of(gpu),
             targets: None,
         })
+    }
+
+    /// The same for 2D Gaussians: disks, whose third scale is not used.
+    ///
+    /// # Errors
+    /// When the device cannot hold 48 more bytes for each visible one.
+    pub fn of_disks(mut self, gpu: &Gpu) -> Result<Self> {
+        self.disks = Some(gpu.buffer("disks", u64::from(self.visible_capacity) * 48)?);
+        self.limits = ListLimits::of_rows(gpu, true);
+        self.targets = None;
+        Ok(self)
     }
 
     /// Capacities: visible Gaussians and intersections.
@@ -193,6 +214,7 @@ impl Frame {
     pub fn bytes(&self) -> (u64, u64) {
         (
             self.projected.size()
+                + self.disks.as_ref().map_or(0, wgpu::Buffer::size)
                 + self.gaussian_from_visible.size()
                 + self.segments.size()
                 + self.offsets.size()
@@ -217,7 +239,9 @@ impl Frame {
         for sort in [&self.depth_sort, &self.tile_sort] {
             buffers.extend(sort.scratch());
         }
+        buffers.extend(&self.disks);
         if let Some(targets) = &self.targets {
+            buffers.extend(&targets.normal_image);
             buffers.extend([&targets.image, &targets.range_image, &targets.ranges, &targets.tile_ends]);
         }
         buffers
@@ -255,6 +279,10 @@ impl Frame {
         self.targets = Some(FrameTargets {
             image: gpu.buffer("image", pixels * 16)?,
             range_image: gpu.buffer("range image", pixels * 4)?,
+            normal_image: match &self.disks {
+                Some(_) => Some(gpu.buffer("normal image", pixels * 16)?),
+                None => None,
+            },
             ranges: gpu.buffer("tile ranges", (tiles + 1) * 8)?,
             tile_ends: gpu.buffer("tile ends", tiles * 4)?,
             pixels,
@@ -287,21 +315,20 @@ impl Frame {
     ) -> Result<()> {
         self.record_lists(gpu, recorder, blocks, view)?;
         let targets = self.targets()?;
-        let tiles = view.tile_count();
-        recorder.dispatch(
-            "rasterize_forward",
-            Size::Groups(view.end_tile - view.first_tile),
-            &[
-                ("frame", &self.uniform),
-                ("projected", &self.projected),
-                ("slots", self.sorted_slots(tiles)),
-                ("visible_from_slot", &self.visible_from_slot),
-                ("ranges", &targets.ranges),
-                ("image", &targets.image),
-                ("range_image", &targets.range_image),
-                ("tile_ends", &targets.tile_ends),
-            ],
-        )
+        let mut bound = vec![
+            ("frame", &self.uniform),
+            ("projected", &self.projected),
+            ("slots", self.sorted_slots(view.tile_count())),
+            ("visible_from_slot", &self.visible_from_slot),
+            ("ranges", &targets.ranges),
+            ("image", &targets.image),
+            ("range_image", &targets.range_image),
+            ("tile_ends", &targets.tile_ends),
+        ];
+        let of_disks = self.disks.iter().map(|disks| ("disks", disks));
+        bound.extend(of_disks.chain(targets.normal_image.iter().map(|image| ("normal_image", image))));
+        let kernel = if self.disks.is_some() { "rasterize_disks" } else { "rasterize_forward" };
+        recorder.dispatch(kernel, Size::Groups(view.end_tile - view.first_tile), &bound)
     }
 
     /// Records the visibility test of a view: flags and counters only, so no list can overflow.
@@ -334,7 +361,7 @@ impl Frame {
         for block in blocks.iter() {
             if let Some(bounds) = &block.bounds {
                 recorder.dispatch(
-                    "cull_chunks",
+                    if self.disks.is_some() { "cull_disk_chunks" } else { "cull_chunks" },
                     Size::Items(block.chunks(), 64),
                     &[
                         frame,
@@ -345,20 +372,14 @@ impl Frame {
                 )?;
             }
             recorder.dispatch(
-                "cull",
+                if self.disks.is_some() { "cull_disks" } else { "cull" },
                 Size::Items(block.count, 64),
                 &[
                     frame,
                     ("block", &block.uniform),
                     ("transforms", &block.transforms),
                     ("chunk_seen", &block.chunk_seen),
-                    (
-                        "density_sums",
-                        block
-                            .training
-                            .as_ref()
-                            .map_or(&self.no_density_sums, |training| &training.density_sums),
-                    ),
+                    ("density_sums", self.density_sums(block)),
                     ("flags", &self.flags),
                 ],
             )?;
@@ -399,30 +420,7 @@ impl Frame {
         };
         self.record_cull(gpu, recorder, blocks, &within)?;
         for block in blocks.iter() {
-            recorder.dispatch(
-                "project_forward",
-                Size::Items(block.count, 64),
-                &[
-                    frame,
-                    ("block", &block.uniform),
-                    ("transforms", &block.transforms),
-                    ("sh_coeffs", &block.sh_coeffs),
-                    (
-                        "density_sums",
-                        block
-                            .training
-                            .as_ref()
-                            .map_or(&self.no_density_sums, |training| &training.density_sums),
-                    ),
-                    ("flags", &self.flags),
-                    counters,
-                    ("projected", &self.projected),
-                    ("depth_keys", &self.depth_sort.keys[0]),
-                    ("order", &self.depth_sort.values[0]),
-                    ("gaussian_from_visible", &self.gaussian_from_visible),
-                    ("water", &self.water),
-                ],
-            )?;
+            self.record_projection(recorder, block)?;
         }
         let groups =
             [counter::ARGS_DEPTH_SORT, counter::ARGS_DEPTH_SCAN].map(|slot| Size::Indirect(&self.args, slot));
@@ -466,6 +464,35 @@ impl Frame {
             Size::Indirect(&self.args, counter::ARGS_INTERSECT),
             &[counters, ("tile_keys", self.sorted_tiles(tiles)), ("ranges", &targets.ranges)],
         )
+    }
+
+    fn record_projection(&self, recorder: &mut Recorder<'_>, block: &Block) -> Result<()> {
+        let (kernel, of_shape) = match &self.disks {
+            Some(disks) => ("project_disks", ("disks", disks)),
+            None => ("project_forward", ("density_sums", self.density_sums(block))),
+        };
+        recorder.dispatch(
+            kernel,
+            Size::Items(block.count, 64),
+            &[
+                ("frame", &self.uniform),
+                ("block", &block.uniform),
+                ("transforms", &block.transforms),
+                ("sh_coeffs", &block.sh_coeffs),
+                of_shape,
+                ("flags", &self.flags),
+                ("counters", &self.counters),
+                ("projected", &self.projected),
+                ("depth_keys", &self.depth_sort.keys[0]),
+                ("order", &self.depth_sort.values[0]),
+                ("gaussian_from_visible", &self.gaussian_from_visible),
+                ("water", &self.water),
+            ],
+        )
+    }
+
+    fn density_sums<'a>(&'a self, block: &'a Block) -> &'a wgpu::Buffer {
+        block.training.as_ref().map_or(&self.no_density_sums, |training| &training.density_sums)
     }
 
     /// Waits and reports whether a list was too short since the lists were made or [`Frame::grow`] was
@@ -517,7 +544,8 @@ impl Frame {
     /// # Errors
     /// When the device cannot hold them in addition to the old ones, which then stay.
     pub fn replace_lists(&mut self, gpu: &Gpu, visible: u32, intersections: u32) -> Result<()> {
-        let new = Self::new(gpu, self.gaussian_capacity, visible, intersections)?.with_limits(self.limits);
+        let new = Self::new(gpu, self.gaussian_capacity, visible, intersections)?;
+        let new = if self.disks.is_some() { new.of_disks(gpu)? } else { new }.with_limits(self.limits);
         let targets = self.targets.take();
         *self = Self { targets, water: self.water.clone(), ..new };
         Ok(())

@@ -15,7 +15,8 @@ pub struct TileLayout {
     /// Side of a tile, pixels; a multiple of 8.
     pub tile: u32,
     /// Whether the threads of a tile are the lanes of one vector (then `tile` is 8). If so, the imports
-    /// `exchange` and `sums` are the files that end in `_vector`, otherwise those that end in `_workgroup`.
+    /// `exchange` and `sums`, also of disks, are the files that end in `_vector`, otherwise those that end in
+    /// `_workgroup`.
     pub vector: bool,
     /// Whether scans and sorts use the files that end in `_subgroups`, where they exist.
     pub subgroups: bool,
@@ -51,15 +52,20 @@ struct Variant {
 }
 
 impl Variant {
-    /// The variants that the header of a file declares.
-    fn of(text: &'static str) -> impl Iterator<Item = Self> {
-        text.lines().filter_map(|line| line.strip_prefix(VARIANT)).filter_map(|line| {
+    /// The variants that the header of a file declares. Lines that name the same one add to it.
+    fn of(text: &'static str) -> Vec<Self> {
+        let mut variants: Vec<Self> = Vec::new();
+        for line in text.lines().filter_map(|line| line.strip_prefix(VARIANT)) {
             let mut words = line.split_whitespace();
-            let name = words.next()?;
+            let Some(name) = words.next() else { continue };
             let imports = words.filter_map(|word| word.split_once('='));
-            let imports = imports.map(|(import, files)| (import, files.split('+').collect())).collect();
-            Some(Self { name, imports })
-        })
+            let imports = imports.map(|(import, files)| (import, files.split('+').collect()));
+            match variants.iter_mut().find(|variant| variant.name == name) {
+                Some(variant) => variant.imports.extend(imports),
+                None => variants.push(Self { name, imports: imports.collect() }),
+            }
+        }
+        variants
     }
 
     fn stands_for(&self, import: &str) -> Option<&[&'static str]> {
@@ -69,8 +75,9 @@ impl Variant {
 
 /// The file that a kernel is made from, by name, and its variant if the file declares any.
 fn file_of(kernel: &str) -> (&str, Option<Variant>) {
-    let variants =
-        STAGES.iter().flat_map(|(file, text)| Variant::of(text).map(move |variant| (*file, variant)));
+    let variants = STAGES
+        .iter()
+        .flat_map(|(file, text)| Variant::of(text).into_iter().map(move |variant| (*file, variant)));
     match variants.into_iter().find(|(_, variant)| variant.name == kernel) {
         Some((file, variant)) => (file, Some(variant)),
         None => (kernel, None),
@@ -117,7 +124,9 @@ pub fn shader_source(name: &str, layout: TileLayout) -> Result<String> {
                     source.push_str(find(SHARED, file)?);
                 }
             }
-            ("exchange" | "sums", None) => source.push_str(find(SHARED, &format!("{import}_{kind}"))?),
+            ("exchange" | "sums" | "exchange_disks" | "sums_disks", None) => {
+                source.push_str(find(SHARED, &format!("{import}_{kind}"))?)
+            }
             (import, None) => source.push_str(find(SHARED, import)?),
         }
     }

@@ -425,6 +425,17 @@ pub struct PriorsUniform {
     pub pad1: f32,
 }
 
+/// `Normals` of `shared/normals.wgsl`.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
+#[expect(missing_docs, reason = "explained in the shader")]
+pub struct NormalsUniform {
+    pub weight: f32,
+    pub least_alpha: f32,
+    pub pad_a: f32,
+    pub pad_b: f32,
+}
+
 /// Rows of partial sums of `water_gradients` for this many Gaussians in this many blocks. The last block
 /// counts as full.
 pub(crate) fn water_rows(gaussians: u32, blocks: u32) -> u32 {

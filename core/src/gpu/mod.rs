@@ -30,11 +30,11 @@ pub use kernel::{
 pub(crate) use layout::water_rows;
 pub use layout::{
     BlockUniform, DbdrState, DbdrUniform, ExposureUniform, FilmUniform, FrameUniform, LossUniform,
-    MediumUniform, PriorsUniform, StepUniform, WaterState, WaterUniform, counter, medium,
+    MediumUniform, NormalsUniform, PriorsUniform, StepUniform, WaterState, WaterUniform, counter, medium,
 };
 pub use memory::{DeviceMemory, Spare};
 pub use photograph::{DeviceMap, DevicePhotograph};
-pub use render::{Output, Rendered, Renderer, WaterView};
+pub use render::{Drawing, Output, Rendered, Renderer, WaterView};
 pub use seams::SeamRun;
 pub use sort::{Scan, Sort};
 pub use workload::Workload;

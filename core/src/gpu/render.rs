@@ -129,6 +129,15 @@ impl WaterView {
     }
 }
 
+/// How the Gaussians of a model were trained ([`crate::ply::drawing`]).
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Drawing {
+    /// With the 2D filter of Mip-Splatting.
+    pub mip_filter: bool,
+    /// As disks.
+    pub disks: bool,
+}
+
 /// Renders one model from any camera.
 pub struct Renderer {
     gpu: Arc<Gpu>,
@@ -177,12 +186,23 @@ impl Renderer {
         Ok(Self { gpu, blocks, recoloured: None, frame, order: Vec::new(), options })
     }
 
-    /// Renders with or without the 2D filter of Mip-Splatting: as the model was trained
-    /// ([`crate::ply::is_antialiased`]).
+    /// Renders with or without the 2D filter of Mip-Splatting.
     #[must_use]
     pub fn with_mip_filter(mut self, mip_filter: bool) -> Self {
         self.options.mip_filter = mip_filter;
         self
+    }
+
+    /// Renders the Gaussians as they were trained.
+    ///
+    /// # Errors
+    /// When the device cannot hold 48 more bytes for each visible disk.
+    pub fn drawn(mut self, drawing: Drawing) -> Result<Self> {
+        self.options.mip_filter = drawing.mip_filter;
+        if drawing.disks {
+            self.frame = self.frame.of_disks(&self.gpu)?;
+        }
+        Ok(self)
     }
 
     /// Renders through this water, for models whose colours are J; [`WaterView::output`] selects the image.

@@ -3,7 +3,7 @@
 
 use std::sync::Arc;
 
-use super::{Gpu, Renderer};
+use super::{Drawing, Gpu, Renderer};
 use crate::config::SeamsConfig;
 use crate::gaussians::Gaussians;
 use crate::metrics::SsimMap;
@@ -27,12 +27,12 @@ impl SeamRun {
     pub fn new(
         gpu: &Arc<Gpu>,
         model: &Gaussians,
-        mip_filter: bool,
+        drawing: Drawing,
         viewing_distance: Option<f32>,
         (lines, config): (SeamLines, SeamsConfig),
     ) -> Result<Self> {
         let surfaces = model.surfaces(viewing_distance);
-        let renderer = Renderer::new(Arc::clone(gpu), &surfaces)?.with_mip_filter(mip_filter);
+        let renderer = Renderer::new(Arc::clone(gpu), &surfaces)?.drawn(drawing)?;
         Ok(Self { renderer, meter: SeamMeter::new(lines, config) })
     }
 
@@ -44,11 +44,11 @@ impl SeamRun {
     pub fn if_it_fits(
         gpu: &Arc<Gpu>,
         model: &Gaussians,
-        mip_filter: bool,
+        drawing: Drawing,
         viewing_distance: Option<f32>,
         measured: (SeamLines, SeamsConfig),
     ) -> Result<Option<Self>> {
-        match Self::new(gpu, model, mip_filter, viewing_distance, measured) {
+        match Self::new(gpu, model, drawing, viewing_distance, measured) {
             Ok(run) => Ok(Some(run)),
             Err(error @ (CoreError::OutOfMemory { .. } | CoreError::BufferTooLarge { .. })) => {
                 tracing::warn!("seams at the borders of cells are not measured: {error}");

@@ -14,10 +14,13 @@ mod write;
 use std::fmt::Write as _;
 
 pub use compressed::{CompressedCopy, compressed};
-pub use read::{SplatReader, SplatRow, from_bytes, is_antialiased, read_model, water_record};
+pub use read::{SplatReader, SplatRow, drawing, from_bytes, read_model, water_record};
 /// Header comment of a model that was trained with the 2D filter of Mip-Splatting and must be rendered with
 /// it.
 pub const ANTIALIASED: &str = "antialiased: opacity makes up for a low-pass of 0.3 px^2";
+
+/// Header comment of a model of 2D Gaussians. Programs that know only 3D Gaussians show them as thin ones.
+pub const DISKS: &str = "disks: 2D Gaussians, whose third scale is not rendered";
 
 pub use rows::replace_rows;
 pub use write::{SplatWriter, to_bytes, write_model, write_whole};

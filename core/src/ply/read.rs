@@ -12,6 +12,7 @@ use std::path::Path;
 use super::Layout;
 use super::header::{Element, Format, Header, Scalar};
 use crate::gaussians::Gaussians;
+use crate::gpu::Drawing;
 use crate::water::WaterRecord;
 use crate::{CoreError, Result};
 
@@ -291,12 +292,15 @@ pub fn read_model(path: &Path) -> Result<Gaussians> {
     SplatReader::open(path).and_then(read_all)
 }
 
-/// Whether the header of a model has the comment [`super::ANTIALIASED`].
+/// How the Gaussians of a model were trained, from the comments [`super::ANTIALIASED`] and [`super::DISKS`]
+/// in its header.
 ///
 /// # Errors
 /// As [`SplatReader::open`].
-pub fn is_antialiased(path: &Path) -> Result<bool> {
-    Ok(SplatReader::open(path)?.comments().iter().any(|comment| comment == super::ANTIALIASED))
+pub fn drawing(path: &Path) -> Result<Drawing> {
+    let reader = SplatReader::open(path)?;
+    let has = |comment: &str| reader.comments().iter().any(|known| known == comment);
+    Ok(Drawing { mip_filter: has(super::ANTIALIASED), disks: has(super::DISKS) })
 }
 
 /// The water record in the header of a model; `None` for a model without a medium.

@@ -279,8 +279,8 @@ fn a_header_says_whether_the_mip_splatting_filter_is_used() {
         [(vec![], false), (vec!["antialiased".to_owned()], false), (vec![ANTIALIASED.to_owned()], true)]
     {
         write_model(&path, &sample(3, 1), &comments).unwrap();
-        assert_eq!(is_antialiased(&path).unwrap(), filtered, "{comments:?}");
+        assert_eq!(drawing(&path).unwrap().mip_filter, filtered, "{comments:?}");
     }
     std::fs::remove_file(&path).unwrap();
-    assert!(is_antialiased(&path).is_err());
+    assert!(drawing(&path).is_err());
 }

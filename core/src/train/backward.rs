@@ -1,9 +1,10 @@
 //! The backward pass of a view and the optimiser step, in one piece or band by band.
 
-use crate::Result;
 use crate::appearance::chain::{Appearance, SplatGradients};
 use crate::config::Moments;
 use crate::gpu::{Block, BlockTraining, Blocks, Frame, FrameUniform, Gpu, Recorder, Size, counter};
+use crate::memory;
+use crate::{CoreError, Result};
 
 /// Buffers of the backward pass besides those of the frame and the blocks.
 #[derive(Clone, Copy)]
@@ -12,12 +13,23 @@ pub struct BackwardBuffers<'a> {
     pub v_image: &'a wgpu::Buffer,
     /// `[H*W]`: gradient of the loss with respect to the range image.
     pub v_range: &'a wgpu::Buffer,
-    /// `[intersections*3]` vec4: gradients of the splats in each tile.
+    /// `[intersections*3]` vec4: gradients of the splats in each tile; of disks `[intersections*5]`.
     pub slot_gradients: &'a wgpu::Buffer,
+    /// Of a frame of disks.
+    pub disks: Option<DiskBuffers<'a>>,
     /// `StepUniform`.
     pub step: &'a wgpu::Buffer,
     /// Appearances whose parameters move with the Gaussians.
     pub appearances: &'a [&'a dyn Appearance],
+}
+
+/// Buffers of the backward pass of disks.
+#[derive(Clone, Copy)]
+pub struct DiskBuffers<'a> {
+    /// `[H*W]` vec4: gradient of the loss with respect to the blended normals.
+    pub v_normal: &'a wgpu::Buffer,
+    /// `[H*W*2]` vec4, written here: what the backward pass needs of each pixel.
+    pub v_pixels: &'a wgpu::Buffer,
 }
 
 /// Records the backward pass and the step of a view that [`Frame::record_forward`] rendered whole.
@@ -38,9 +50,11 @@ pub fn record_backward(
         appearance.record_gradients(gpu, recorder, splats)?;
     }
     for (index, block, training) in blocks.trainable() {
-        let kernel = match training.kind {
-            Moments::Compact => "project_backward",
-            Moments::F32 => "project_backward_f32",
+        let kernel = match (training.kind, buffers.disks.is_some()) {
+            (Moments::Compact, false) => "project_backward",
+            (Moments::F32, false) => "project_backward_f32",
+            (Moments::Compact, true) => "project_disks_backward",
+            (Moments::F32, true) => "project_disks_backward_f32",
         };
         let groups = Size::Indirect(&frame.args, counter::ARGS_BLOCK + index as u32);
         let sources = [
@@ -71,15 +85,16 @@ pub fn record_backward_in_bands(
     bands: &[FrameUniform],
     buffers: BackwardBuffers<'_>,
 ) -> Result<()> {
+    let row_bytes = memory::slot_bytes(buffers.disks.is_some());
     for (_, block, training) in blocks.trainable() {
-        recorder.clear(training.band_gradients(gpu, block.capacity)?);
+        recorder.clear(training.band_gradients(gpu, block.capacity, row_bytes)?);
     }
     for band in bands {
         frame.record_lists(gpu, recorder, blocks, band)?;
         record_rasterize(recorder, frame, band, buffers)?;
         for (index, block, training) in blocks.trainable() {
             recorder.dispatch(
-                "add_band_gradients",
+                if buffers.disks.is_some() { "add_disk_band_gradients" } else { "add_band_gradients" },
                 Size::Indirect(&frame.args, counter::ARGS_BLOCK + index as u32),
                 &[
                     ("frame", &frame.uniform),
@@ -89,7 +104,7 @@ pub fn record_backward_in_bands(
                     ("gaussian_from_visible", &frame.gaussian_from_visible),
                     ("segments", &frame.segments),
                     ("slot_gradients", buffers.slot_gradients),
-                    ("band_gradients", training.band_gradients(gpu, block.capacity)?),
+                    ("band_gradients", training.band_gradients(gpu, block.capacity, row_bytes)?),
                 ],
             )?;
         }
@@ -102,11 +117,13 @@ pub fn record_backward_in_bands(
         appearance.record_gradients(gpu, recorder, splats)?;
     }
     for (_, block, training) in blocks.trainable() {
-        let kernel = match training.kind {
-            Moments::Compact => "project_backward_bands",
-            Moments::F32 => "project_backward_bands_f32",
+        let kernel = match (training.kind, buffers.disks.is_some()) {
+            (Moments::Compact, false) => "project_backward_bands",
+            (Moments::F32, false) => "project_backward_bands_f32",
+            (Moments::Compact, true) => "project_disks_backward_bands",
+            (Moments::F32, true) => "project_disks_backward_bands_f32",
         };
-        let sources = [("band_gradients", training.band_gradients(gpu, block.capacity)?)];
+        let sources = [("band_gradients", training.band_gradients(gpu, block.capacity, row_bytes)?)];
         let groups = Size::Items(block.count, 64);
         record_step(recorder, kernel, groups, frame, block, training, &sources, buffers.step)?;
     }
@@ -124,6 +141,9 @@ fn record_rasterize(
     buffers: BackwardBuffers<'_>,
 ) -> Result<()> {
     let targets = frame.targets()?;
+    if let Some(disks) = buffers.disks {
+        return record_rasterize_disks(recorder, frame, band, buffers, disks);
+    }
     recorder.dispatch(
         "rasterize_backward",
         Size::Groups(band.end_tile - band.first_tile),
@@ -138,6 +158,48 @@ fn record_rasterize(
             ("range_image", &targets.range_image),
             ("v_image", buffers.v_image),
             ("v_range_image", buffers.v_range),
+            ("slot_gradients", buffers.slot_gradients),
+        ],
+    )
+}
+
+fn record_rasterize_disks(
+    recorder: &mut Recorder<'_>,
+    frame: &Frame,
+    band: &FrameUniform,
+    buffers: BackwardBuffers<'_>,
+    of_disks: DiskBuffers<'_>,
+) -> Result<()> {
+    let targets = frame.targets()?;
+    let (Some(disks), Some(normal_image)) = (&frame.disks, &targets.normal_image) else {
+        return Err(CoreError::Gpu("the backward pass of disks needs a frame of disks".into()));
+    };
+    recorder.dispatch(
+        "gather_pixel_gradients",
+        Size::Items(band.size[0] * band.size[1], 64),
+        &[
+            ("frame", &frame.uniform),
+            ("image", &targets.image),
+            ("range_image", &targets.range_image),
+            ("normal_image", normal_image),
+            ("v_image", buffers.v_image),
+            ("v_range_image", buffers.v_range),
+            ("v_normal_image", of_disks.v_normal),
+            ("v_pixels", of_disks.v_pixels),
+        ],
+    )?;
+    recorder.dispatch(
+        "rasterize_disks_backward",
+        Size::Groups(band.end_tile - band.first_tile),
+        &[
+            ("frame", &frame.uniform),
+            ("projected", &frame.projected),
+            ("disks", disks),
+            ("slots", frame.sorted_slots(band.tile_count())),
+            ("visible_from_slot", &frame.visible_from_slot),
+            ("ranges", &targets.ranges),
+            ("tile_ends", &targets.tile_ends),
+            ("v_pixels", of_disks.v_pixels),
             ("slot_gradients", buffers.slot_gradients),
         ],
     )

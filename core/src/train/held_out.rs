@@ -53,7 +53,7 @@ impl Trainer {
     ) -> Result<Vec<Preview>> {
         let water = self.water_view()?;
         let mut renderer =
-            Renderer::of_run(Arc::clone(&self.gpu), &self.blocks)?.with_mip_filter(self.config.mip_filter);
+            Renderer::of_run(Arc::clone(&self.gpu), &self.blocks)?.drawn(self.config.drawing())?;
         let mut previews = Vec::with_capacity(cameras.len());
         for (camera, pose) in cameras {
             if !go_on() {
@@ -87,7 +87,7 @@ impl Trainer {
         let iteration = self.progress().iteration;
         let model = self.gaussians()?;
         let mut renderer = Renderer::new(Arc::clone(&self.gpu), &model)?
-            .with_mip_filter(self.config.mip_filter)
+            .drawn(self.config.drawing())?
             .with_water(self.water_view()?);
         let mut measured = Vec::new();
         for (index, view) in held_out.views().iter().enumerate() {

@@ -6,7 +6,7 @@ use super::MediumRun;
 use super::background::background_gaussians;
 use crate::config::{Strategy, TrainConfig};
 use crate::gaussians::{Gaussians, MAX_SH_COEFFS, SH_C0};
-use crate::rng::{Stream, permutation};
+use crate::rng::{Stream, permutation, random_bits, uniform};
 use crate::scene::Points;
 use crate::views::TrainView;
 use crate::{CoreError, Result};
@@ -45,7 +45,22 @@ pub fn initial_gaussians(
     let room = config.max_gaussians - far.len() as u32;
     let mut model = limit(gaussians_from_points(points, opacity, config.sh_degree)?, room, config.seed);
     (0..far.len()).for_each(|index| model.push_from(&far, index));
+    if config.disks {
+        turn(&mut model, config.seed);
+    }
     Ok(model)
+}
+
+/// Turns disks at random, as 2DGS does: no direction is preferred.
+fn turn(model: &mut Gaussians, seed: u32) {
+    let number = |index: u32, k: u32| random_bits(seed, Stream::Turn, index, k).map(uniform);
+    for (quat, index) in model.quats.iter_mut().zip(0..) {
+        // Uniform over all rotations (Shoemake 1992).
+        let [share, first, second] = number(index, 0);
+        let (first, second) = (std::f32::consts::TAU * first, std::f32::consts::TAU * second);
+        let (a, b) = ((1.0 - share).sqrt(), share.sqrt());
+        *quat = [a * first.sin(), a * first.cos(), b * second.sin(), b * second.cos()];
+    }
 }
 
 /// Gaussians at sparse points: scale from the three nearest neighbours, colour in SH degree 0 (3DGS).

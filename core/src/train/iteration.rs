@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use super::target_images::Key;
-use super::{BackwardBuffers, Trainer, record_backward, record_backward_in_bands};
+use super::{BackwardBuffers, DiskMaps, Trainer, record_backward, record_backward_in_bands};
 use crate::Result;
 use crate::appearance::chain::{Gradients, Iteration};
 use crate::gpu::{DevicePhotograph, FrameUniform, KernelTime, Recorder, StepUniform, Workload};
@@ -76,6 +76,9 @@ impl Trainer {
         self.frame.prepare_targets(&self.gpu, frame.size)?;
         self.loss.prepare(&self.gpu, frame.size)?;
         self.appearances.prepare(&self.gpu, frame.size)?;
+        if let Some(disks) = &mut self.disks {
+            disks.prepare(&self.gpu, frame.size)?;
+        }
         let trainable = self.blocks.trainable_total();
         let mut step = StepUniform { trainable, ..self.schedule.rates(progress, self.extent) };
         self.appearances.weigh(&mut step, view);
@@ -99,6 +102,11 @@ impl Trainer {
             at_once = self.predict_at_once(&gpu, photograph.size)?;
         }
         self.record_loss(recorder, &self.seen_in(iteration, key, &photograph, is_predicted))?;
+        if let Some(disks) = &self.disks {
+            let weight = self.schedule.normal_consistency(progress) / (frame.size[0] * frame.size[1]) as f32;
+            let gradients = [self.loss.v_image()?, self.loss.v_range()?];
+            disks.record(&gpu, recorder, &self.frame, &frame, weight, gradients)?;
+        }
         if let Some(at_once) = at_once {
             self.learn_at_once(&gpu, recorder, at_once)?;
         }
@@ -107,6 +115,7 @@ impl Trainer {
             v_image: self.loss.v_image()?,
             v_range: self.loss.v_range()?,
             slot_gradients: &self.slot_gradients,
+            disks: self.disks.as_ref().map(DiskMaps::buffers),
             step: &self.step,
             appearances: &self.appearances.stepped_with_gaussians(&now),
         };
@@ -142,6 +151,11 @@ impl Trainer {
     /// Records the stages between the blended image and its gradient: appearances, loss, appearances
     /// backward.
     fn record_loss(&self, recorder: &mut Recorder<'_>, now: &Iteration<'_>) -> Result<()> {
+        if self.disks.is_some() {
+            // Normals add to them. Without water nothing else writes the gradients of alpha and range.
+            recorder.clear(self.loss.v_image()?);
+            recorder.clear(self.loss.v_range()?);
+        }
         let pictures = self.appearances.record(recorder, now, &self.frame.targets()?.image)?;
         let weight = self.config.ssim_weight;
         self.loss.record(now.gpu, recorder, now.photograph, pictures.last, weight, now.number)?;

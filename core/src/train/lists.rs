@@ -61,7 +61,7 @@ impl Trainer {
     /// # Errors
     /// When the device cannot hold them.
     pub fn set_list_limits(&mut self, limits: ListLimits) -> Result<()> {
-        let device = ListLimits::of(&self.gpu);
+        let device = ListLimits::of_rows(&self.gpu, self.config.disks);
         let limits = ListLimits {
             visible: limits.visible.min(device.visible),
             intersections: limits.intersections.min(device.intersections),
@@ -119,5 +119,5 @@ pub(super) fn lists(
 
 /// A buffer with a gradient slot for each intersection.
 pub(super) fn slot_gradients(gpu: &Gpu, frame: &Frame) -> Result<wgpu::Buffer> {
-    gpu.buffer("slot gradients", u64::from(frame.capacities().1) * memory::GRADIENT_BYTES)
+    gpu.buffer("slot gradients", u64::from(frame.capacities().1) * memory::slot_bytes(frame.disks.is_some()))
 }

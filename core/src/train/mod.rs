@@ -10,6 +10,7 @@ mod background;
 mod backward;
 mod checkpoint;
 mod density;
+mod disks;
 mod handover;
 mod held_out;
 mod init;
@@ -42,7 +43,8 @@ pub use crate::appearance::water::{
     DeviceMedium, DevicePriors, Gathered, MediumRun, NetworkRun, PriorMaps, WaterStep,
 };
 pub use crate::gpu::DevicePhotograph;
-pub use backward::{BackwardBuffers, record_backward, record_backward_in_bands};
+pub use backward::{BackwardBuffers, DiskBuffers, record_backward, record_backward_in_bands};
+pub use disks::{DiskMaps, LEAST_ALPHA};
 pub use handover::Surroundings;
 pub use held_out::{HeldOutMetrics, Preview};
 pub use init::initial_gaussians;
@@ -117,6 +119,8 @@ pub struct Trainer {
     appearances: Chain,
     /// Set if WaterParamPredict determines the water at first.
     predictor: Option<Predictor>,
+    /// Set if the Gaussians are disks.
+    disks: Option<DiskMaps>,
     /// Set if there are surfaces that must stay covered.
     surfaces: Option<Surfaces>,
     slot_gradients: wgpu::Buffer,
@@ -157,7 +161,10 @@ impl Trainer {
         let run_digest = checkpoint::run_digest(&run);
         let TrainRun { config, extent, views, focus, context, surfaces, medium } = run;
         let medium = medium.map(|medium| medium.times(config.loss_factor));
-        let focus = init::limit(focus, config.max_gaussians, config.seed);
+        let mut focus = init::limit(focus, config.max_gaussians, config.seed);
+        if config.disks {
+            focus.flatten();
+        }
         let surfaces = Surfaces::new(surfaces, &context)?;
         let mut blocks = Blocks::new(&gpu, config.sh_degree)?;
         blocks.push_trainable(&gpu, &focus, config.max_gaussians, config.moments)?;
@@ -167,6 +174,11 @@ impl Trainer {
         let gaussians = config.max_gaussians.max(focus.len() as u32) + context.len() as u32;
         let lists = lists(&gpu, &config, views.views(), &focus, &context, medium.as_ref());
         let mut frame = Frame::new(&gpu, gaussians, lists.visible, lists.intersections)?;
+        let mut disks = None;
+        if config.disks {
+            frame = frame.of_disks(&gpu)?;
+            disks = Some(DiskMaps::new(&gpu)?);
+        }
         let slot_gradients = slot_gradients(&gpu, &frame)?;
         // Sized for the largest image, so that a run that cannot hold it fails here and not at full
         // resolution.
@@ -192,6 +204,9 @@ impl Trainer {
             frame.prepare_targets(&gpu, size)?;
             loss.prepare(&gpu, size)?;
             appearances.prepare(&gpu, size)?;
+            if let Some(disks) = &mut disks {
+                disks.prepare(&gpu, size)?;
+            }
         }
         let trainer = Self {
             schedule,
@@ -199,6 +214,7 @@ impl Trainer {
             loss,
             appearances,
             predictor,
+            disks,
             surfaces,
             targets: TargetImages::new(views, config.seed, config.prefetch_threads).evictable_on(&gpu),
             initial: focus.len() as u32,
@@ -268,11 +284,15 @@ impl Trainer {
     }
 
     /// The current Gaussians in focus as they are rendered: with the 3D filter of Mip-Splatting if it is on.
+    /// The third scale of disks is a hundredth of the smaller one.
     ///
     /// # Errors
     /// When the device fails.
     pub fn gaussians(&mut self) -> Result<Gaussians> {
-        let model = self.blocks.download(&self.gpu)?;
+        let mut model = self.blocks.download(&self.gpu)?;
+        if self.config.disks {
+            model.flatten();
+        }
         if self.config.mip_filter { Ok(smoothed(model, &self.smoothing()?)) } else { Ok(model) }
     }
 }

@@ -123,6 +123,16 @@ impl Schedule {
     }
 
     /// Learning rates and weights of one step, for a view that sees every Gaussian.
+    /// Weight of the normal consistency of disks.
+    pub(super) fn normal_consistency(&self, progress: f32) -> f32 {
+        let config = &self.config;
+        if progress < config.normal_consistency_from {
+            0.0
+        } else {
+            config.loss_factor * config.normal_consistency
+        }
+    }
+
     pub(super) fn rates(&self, progress: f32, extent: f32) -> StepUniform {
         let c = &self.config;
         let means = extent * interpolate_log(c.means_lr, c.means_lr_end, progress);

@@ -76,7 +76,7 @@ fn fuzzed_models_are_refused_or_survive_a_round_trip() {
     let read = |bytes: &[u8]| {
         let path = folder.put("model.ply", bytes);
         // The coordinator and the renderer read the header of a model in this way.
-        let (record, _) = (ply::water_record(&path), ply::is_antialiased(&path));
+        let (record, _) = (ply::water_record(&path), ply::drawing(&path));
         if let Ok(Some(record)) = &record {
             assert!(record.water().is_physical());
         }

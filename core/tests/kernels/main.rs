@@ -14,6 +14,8 @@ mod culling;
 mod dbdr;
 mod density;
 mod device;
+mod disk_training;
+mod disks;
 mod exposure;
 mod film;
 mod floaters;

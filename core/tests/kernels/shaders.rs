@@ -4,7 +4,8 @@ use std::mem::offset_of;
 
 use fathom_core::gpu::{
     BlockUniform, DbdrState, DbdrUniform, ExposureUniform, FilmUniform, FrameUniform, LossUniform,
-    MediumUniform, PriorsUniform, StepUniform, TileLayout, WaterState, WaterUniform, shader_source,
+    MediumUniform, NormalsUniform, PriorsUniform, StepUniform, TileLayout, WaterState, WaterUniform,
+    shader_source,
 };
 
 /// Asserts that struct `name` of `stage` has the size and the offsets of its mirror.
@@ -97,6 +98,7 @@ fn uniforms_of_the_host_have_the_layout_of_the_shaders() {
         view_unbias1,
         view_unbias2,
     );
+    mirror!("normal_consistency", "Normals", NormalsUniform, weight, least_alpha, pad_a, pad_b);
     mirror!("expose", "Exposure", ExposureUniform, pixels, view, views, pad0, rate, unbias1, unbias2, pad1,);
     mirror!(
         "water",

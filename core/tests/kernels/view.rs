@@ -128,6 +128,20 @@ impl View {
         view
     }
 
+    /// Renders the model as disks.
+    pub fn render_disks(gpu: &Arc<Gpu>, scene: &Scene) -> Self {
+        let mut blocks = Blocks::new(gpu, scene.model.sh_degree).unwrap();
+        blocks.push_trainable(gpu, &scene.model, scene.model.len() as u32, Moments::F32).unwrap();
+        let mut view = Self::prepare(gpu, scene, blocks);
+        let (visible, intersections) = view.frame.capacities();
+        let lists = Frame::new(gpu, view.blocks.total(), visible, intersections).unwrap();
+        view.frame = lists.of_disks(gpu).unwrap();
+        view.frame.prepare_targets(gpu, view.uniform.size).unwrap();
+        view.frame.scratch().into_iter().for_each(|buffer| super::device::poison(gpu, buffer));
+        view.forward();
+        view
+    }
+
     /// Makes the buffers without rendering, with room for every splat in every tile.
     pub fn prepare(gpu: &Arc<Gpu>, scene: &Scene, blocks: Blocks) -> Self {
         let tile = gpu.tile();
@@ -265,6 +279,7 @@ impl View {
                 v_image: &v_image,
                 v_range: &v_range,
                 slot_gradients: &slots,
+                disks: None,
                 step: &step,
                 appearances: &[],
             },

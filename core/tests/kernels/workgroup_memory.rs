@@ -142,6 +142,7 @@ fn iteration(gpu: &Arc<Gpu>, recorder: fn(&Gpu) -> Recorder<'_>) -> [Vec<u32>; 8
         v_image: &v_image,
         v_range: &v_range,
         slot_gradients: &slot_gradients,
+        disks: None,
         step: &step,
         appearances: &[],
     };

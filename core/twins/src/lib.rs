@@ -17,6 +17,7 @@ mod adam;
 mod brute_force;
 mod chain;
 mod dbdr;
+mod disks;
 mod exposure;
 mod film;
 #[cfg(test)]
@@ -24,6 +25,7 @@ mod finite_differences;
 mod gaussians64;
 mod intersect;
 mod loss;
+mod normals;
 mod priors;
 mod project_backward;
 mod project_forward;
@@ -39,11 +41,16 @@ pub use adam::{
 };
 pub use chain::{ViewGradients, ViewInput, render, view_gradients};
 pub use dbdr::{RefinementState, form_refined, form_refined_backward};
+pub use disks::{
+    Disk, DiskGradient, DiskRaster, DiskRasterGradients, DiskRay, bounds_of, pinhole_rays, project_disks,
+    project_disks_backward, trace_backward, trace_forward,
+};
 pub use exposure::{Exposure, ExposureState, IDENTITY, expose, expose_backward};
 pub use film::{Embedding, FilmGradients, FilmPicture, FilmState, FilmWeights, UNITS, film, film_backward};
 pub use gaussians64::Gaussians64;
 pub use intersect::{TileLists, depth_order, intersect, min_sigma_in_rect};
 pub use loss::{Loss, SSIM_TAPS, loss, ssim_map, unpack};
+pub use normals::{NormalConsistency, normal_consistency};
 pub use priors::{
     DarkChannel, LEAST_ATTENUATION, PriorLoss, PriorView, channel_weights, dark_channel, depth_smoothness,
     patch_minima,

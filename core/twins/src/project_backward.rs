@@ -137,7 +137,7 @@ fn outer(a: DVec3, b: DVec3) -> DMat3 {
 }
 
 /// Gradient of q through R(q / |q|); `v_rotation` is the derivative with respect to each entry of R.
-fn quat_backward(quat: [f64; 4], v_rotation: DMat3) -> [f64; 4] {
+pub(super) fn quat_backward(quat: [f64; 4], v_rotation: DMat3) -> [f64; 4] {
     let length = norm(quat);
     let unit = quat.map(|v| v / length);
     let [w, x, y, z] = unit;

@@ -182,7 +182,7 @@ fn ratio_bounds(camera: &PinholeCamera) -> (DVec2, DVec2) {
 }
 
 /// Rotation of a quaternion w x y z of any length above 0.
-fn rotation_matrix(quat: [f64; 4]) -> DMat3 {
+pub(super) fn rotation_matrix(quat: [f64; 4]) -> DMat3 {
     let [w, x, y, z] = quat.map(|v| v / norm(quat));
     DMat3::from_cols(
         DVec3::new(1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y)),

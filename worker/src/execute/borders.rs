@@ -12,7 +12,7 @@ use std::sync::Arc;
 use bytes::Bytes;
 use fathom_core::config::TrainConfig;
 use fathom_core::gaussians::{Gaussians, is_shared};
-use fathom_core::gpu::{Gpu, Renderer};
+use fathom_core::gpu::{Drawing, Gpu, Renderer};
 use fathom_core::train::{MediumRun, TrainRun};
 use fathom_core::views::ViewSource;
 use fathom_core::{CoreError, ply};
@@ -87,7 +87,8 @@ fn views_of(
     let (band, surroundings) = (Boxes::new(&spec.band)?, Boxes::new(&spec.surroundings)?);
     // Without Gaussians that would move the surfaces, as for a partition.
     let surfaces = model.surfaces(task.common.viewing_distance);
-    let renderer = Renderer::new(Arc::clone(gpu), &surfaces)?;
+    let renderer = Renderer::new(Arc::clone(gpu), &surfaces)?
+        .drawn(Drawing { mip_filter: false, ..task.config.train.drawing() })?;
     drop(surfaces);
     let go_on = || control.stop_reason().is_none();
     let shows = |point| band.contain(point);

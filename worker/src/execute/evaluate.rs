@@ -50,12 +50,12 @@ pub fn run(
     let gaussians = model.len() as u32;
     let record = ply::water_record(path)?;
     let through = |output| record.as_ref().map(|record| WaterView::of_record(record, output));
-    let mip_filter = ply::is_antialiased(path)?;
-    let mut renderer = Renderer::new(Arc::clone(gpu), &model)?.with_mip_filter(mip_filter);
+    let drawing = ply::drawing(path)?;
+    let mut renderer = Renderer::new(Arc::clone(gpu), &model)?.drawn(drawing)?;
     let mut seams = match &spec.seams {
         Some(lines) => {
             let measured = (seam_lines(lines)?, task.config.seams.clone());
-            SeamRun::if_it_fits(gpu, &model, mip_filter, task.common.viewing_distance, measured)?
+            SeamRun::if_it_fits(gpu, &model, drawing, task.common.viewing_distance, measured)?
         }
         None => None,
     };

@@ -96,7 +96,7 @@ pub fn own_part(
     let go_on = || control.stop_reason().is_none();
     // Haze would move the surface towards the camera, and background Gaussians would end rays that meet no
     // surface.
-    let renderer = Renderer::new(Arc::clone(gpu), &solid)?.with_mip_filter(task.config.train.mip_filter);
+    let renderer = Renderer::new(Arc::clone(gpu), &solid)?.drawn(task.config.train.drawing())?;
     let views = LossMask::new(renderer, views, |point| inside.contains(point), go_on)?;
     let Some(views) = views else { return Err(TaskError::Stopped { checkpoint: None }) };
     Ok(Some(OwnPart { parts, views: Arc::new(views), config }))

@@ -196,7 +196,7 @@ fn only_a_mip_filter_model_has_it_in_its_header() {
         let done = executor.execute(&task, &AtFirstReport(|| {})).unwrap();
         let model = dir.path().join("model.ply");
         std::fs::write(&model, &done.result).unwrap();
-        assert_eq!(fathom_core::ply::is_antialiased(&model).unwrap(), mip_filter);
+        assert_eq!(fathom_core::ply::drawing(&model).unwrap().mip_filter, mip_filter);
     }
 }
 

@@ -351,6 +351,7 @@ pub fn output_of(
 ) -> Result<TaskOutput, TaskError> {
     let mut comments: Vec<String> =
         config.mip_filter.then(|| ply::ANTIALIASED.to_owned()).into_iter().collect();
+    comments.extend(config.disks.then(|| ply::DISKS.to_owned()));
     comments.extend(water.map(WaterRecord::to_comment).transpose()?);
     let ordered = gaussians.in_order(&spatial_order(gaussians));
     let result = Bytes::from(ply::to_bytes(&ordered, &comments)?);

@@ -5,6 +5,7 @@ use crate::Result;
 use crate::appearance::chain::{Appearance, Gradients, Iteration, SplatGradients};
 use crate::appearance::water::{DeviceMedium, StartedWater};
 use crate::gpu::{Frame, Gpu, Recorder, Size, StepUniform};
+use crate::memory;
 use crate::views::TrainView;
 
 /// A water that acts on Gaussians.
@@ -41,7 +42,8 @@ impl DeviceMedium {
             ];
             let size = Size::Items(block.count, 64);
             if in_bands {
-                let sums = ("band_gradients", training.band_gradients(gpu, block.capacity)?);
+                let sums =
+                    ("band_gradients", training.band_gradients(gpu, block.capacity, memory::BAND_BYTES)?);
                 recorder.dispatch("water_gradients_bands", size, &[&common[..], &[sums]].concat())?;
             } else {
                 let slots =

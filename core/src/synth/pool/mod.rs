@@ -130,7 +130,7 @@ pub fn synthesise_pool(
     files::write_colmap(&out.join("sparse/0"), &camera, &names, &poses, &points)?;
     let depths: Vec<_> = (0..poses.len())
         .into_par_iter()
-        .filter(|view| view % TRUTH_EVERY == 0)
+        .filter(|view| view.is_multiple_of(TRUTH_EVERY))
         .map(|view| (format!("v{:04}", view + 1), depth_map(&world, &camera, &poses[view])))
         .collect();
     files::write_npz(&out.join("truth/depth_m.npz"), options.width, options.height, &depths)?;
@@ -262,6 +262,6 @@ impl Photograph {
                 truth.region.put_pixel(x, y, Luma([if wet == rays { 255 } else { 0 }]));
             }
         }
-        Self { pixels, truth: (view % TRUTH_EVERY == 0).then_some(truth) }
+        Self { pixels, truth: (view.is_multiple_of(TRUTH_EVERY)).then_some(truth) }
     }
 }

@@ -1,0 +1,136 @@
+//@ import frame, disk, disk_at_pixels, exchange_disks
+// Blends the disks of a tile, front to back, as rasterize_forward does splats.
+//
+//   image   [H*W]   vec4: rgb over the background, alpha = 1 - T
+//   range_image [H*W]  sum of alpha T range, scene units: to where the ray meets the disk, or to the centre
+//             where the low-pass decides
+//   normal_image [H*W] vec4: sum of alpha T normal, camera axes, towards the camera; 0
+//   tile_ends [tiles]  number of the tile's disks that any pixel needed: the backward pass stops there
+// Twin: core/twins/src/disks.rs
+
+@group(0) @binding(0) var<uniform> frame: Frame;
+@group(0) @binding(1) var<storage, read> projected: array<vec4<f32>>;
+@group(0) @binding(2) var<storage, read> disks: array<vec4<f32>>;
+@group(0) @binding(3) var<storage, read> slots: array<u32>;
+@group(0) @binding(4) var<storage, read> visible_from_slot: array<u32>;
+@group(0) @binding(5) var<storage, read> ranges: array<vec2<u32>>;
+@group(0) @binding(6) var<storage, read_write> image: array<vec4<f32>>;
+@group(0) @binding(7) var<storage, read_write> range_image: array<f32>;
+@group(0) @binding(8) var<storage, read_write> normal_image: array<vec4<f32>>;
+@group(0) @binding(9) var<storage, read_write> tile_ends: array<u32>;
+
+// State of the thread's pixels: rows 0 to 3 in _a, 4 to 7 in _b.
+struct Sums {
+    T: vec4<f32>,
+    // 1 until the ray ends, then 0.
+    on: vec4<f32>,
+    r: vec4<f32>,
+    g: vec4<f32>,
+    b: vec4<f32>,
+    range: vec4<f32>,
+    nx: vec4<f32>,
+    ny: vec4<f32>,
+    nz: vec4<f32>,
+}
+
+var<private> sums_a: Sums;
+var<private> sums_b: Sums;
+// Number of disks that any of the thread's pixels needed.
+var<private> end: u32;
+
+fn empty(on: vec4<f32>) -> Sums {
+    let zero = vec4<f32>(0.0);
+    return Sums(vec4<f32>(1.0), on, zero, zero, zero, zero, zero, zero, zero);
+}
+
+// Adds a disk to four pixels and returns its weights.
+fn add(sums: ptr<private, Sums>, disk: Splat, met: Met, normal: vec3<f32>, lengths: vec4<f32>) -> vec4<f32> {
+    let raw = min(vec4<f32>(MAX_ALPHA), disk.d.y * exp(-0.5 * met.spread));
+    let alpha = select(vec4<f32>(0.0), raw, raw >= vec4<f32>(MIN_ALPHA));
+    let next = (*sums).T * (1.0 - alpha);
+    (*sums).on = select(vec4<f32>(0.0), (*sums).on, next >= vec4<f32>(MIN_TRANSMITTANCE));
+    let w = (*sums).on * alpha * (*sums).T;
+    (*sums).r += w * disk.e.x;
+    (*sums).g += w * disk.e.y;
+    (*sums).b += w * disk.e.z;
+    (*sums).range += w * select(vec4<f32>(disk.d.z), met.t * lengths, met.is_hit);
+    (*sums).nx += w * normal.x;
+    (*sums).ny += w * normal.y;
+    (*sums).nz += w * normal.z;
+    (*sums).T -= w;
+    return w;
+}
+
+fn blend(disk: Splat, number: u32) {
+    let plane = plane_of(disk);
+    let normal = disk.c.w * plane.normal;
+    let w_a = add(&sums_a, disk, meet(disk, plane, ray_y_a, pixel_y_a), normal, ray_length_a);
+    let w_b = add(&sums_b, disk, meet(disk, plane, ray_y_b, pixel_y_b), normal, ray_length_b);
+    let w = w_a + w_b;
+    end = select(end, number + 1u, max(max(w.x, w.y), max(w.z, w.w)) > 0.0);
+}
+
+fn store_pixel(column: u32, row: u32, rgb: vec3<f32>, range: f32, normal: vec3<f32>, T: f32) {
+    if row < frame.size.y {
+        let at = row * frame.size.x + column;
+        image[at] = vec4<f32>(rgb + T * frame.background, 1.0 - T);
+        range_image[at] = range;
+        normal_image[at] = vec4<f32>(normal, 0.0);
+    }
+}
+
+fn store_four(column: u32, row: u32, s: Sums) {
+    store_pixel(column, row, vec3<f32>(s.r.x, s.g.x, s.b.x), s.range.x, vec3<f32>(s.nx.x, s.ny.x, s.nz.x), s.T.x);
+    store_pixel(column, row + 1u, vec3<f32>(s.r.y, s.g.y, s.b.y), s.range.y, vec3<f32>(s.nx.y, s.ny.y, s.nz.y), s.T.y);
+    store_pixel(column, row + 2u, vec3<f32>(s.r.z, s.g.z, s.b.z), s.range.z, vec3<f32>(s.nx.z, s.ny.z, s.nz.z), s.T.z);
+    store_pixel(column, row + 3u, vec3<f32>(s.r.w, s.g.w, s.b.w), s.range.w, vec3<f32>(s.nx.w, s.ny.w, s.nz.w), s.T.w);
+}
+
+@compute @workgroup_size(LANES)
+fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
+        @builtin(local_invocation_index) lane: u32) {
+    let tile = frame.first_tile + folded(group, groups);
+    if tile >= frame.end_tile {
+        return;
+    }
+    let corner = vec2<u32>(tile % frame.tiles.x, tile / frame.tiles.x) * TILE;
+    let column = corner.x + lane % TILE;
+    let row = corner.y + (lane / TILE) * 8u;
+    begin_rays(column, row);
+    end = 0u;
+    // Pixels outside the image end immediately.
+    let inside = column < frame.size.x;
+    let height = vec4<f32>(f32(frame.size.y));
+    sums_a = empty(select(vec4<f32>(0.0), vec4<f32>(1.0), (pixel_y_a < height) & vec4<bool>(inside)));
+    sums_b = empty(select(vec4<f32>(0.0), vec4<f32>(1.0), (pixel_y_b < height) & vec4<bool>(inside)));
+
+    let range = ranges[tile];
+    for (var first = range.x; first < range.y; first += BATCH) {
+        share_splats(lane, first, range.y);
+        let number = first - range.x;
+        blend(shared_splat(0u), number + 0u);
+        blend(shared_splat(1u), number + 1u);
+        blend(shared_splat(2u), number + 2u);
+        blend(shared_splat(3u), number + 3u);
+        blend(shared_splat(4u), number + 4u);
+        blend(shared_splat(5u), number + 5u);
+        blend(shared_splat(6u), number + 6u);
+        blend(shared_splat(7u), number + 7u);
+        // Every fourth batch: stop if all rays of the tile have ended.
+        if (number / BATCH) % 4u == 3u {
+            let on = sums_a.on + sums_b.on;
+            if !any_thread(lane, on.x + on.y + on.z + on.w > 0.0) {
+                break;
+            }
+        }
+    }
+
+    let furthest = greatest(lane, end);
+    if lane == 0u {
+        tile_ends[tile] = furthest;
+    }
+    if inside {
+        store_four(column, row, sums_a);
+        store_four(column, row + 4u, sums_b);
+    }
+}
