@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub enum Method {
-    /// 3D Gaussian splats, with or without a medium: every preset.
+    /// 3D Gaussian splats, with or without a medium.
     #[default]
     Splats,
     /// 2D Gaussians: disks on surfaces (2DGS, Huang et al. 2024).

@@ -20,7 +20,7 @@ mod train;
 mod water;
 mod weights;
 
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 pub use borders::BordersConfig;
 pub use composition::Composition;
@@ -53,14 +53,14 @@ pub enum Preset {
     /// Plain 3D Gaussian splatting without a medium, in sRGB: the control.
     #[serde(rename = "3dgs")]
     Splatting,
-    /// 2D Gaussian splatting (disks) without a medium, in sRGB: surfaces that are nearer to the truth.
+    /// 2D Gaussian splatting (disks) without a medium, in sRGB.
     #[serde(rename = "2dgs")]
     Disks,
 }
 
 /// Everything except the input that determines the result of a job.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
+#[serde(default, deny_unknown_fields, remote = "Self")]
 pub struct JobConfig {
     /// Starting point of all other values.
     pub preset: Preset,
@@ -81,6 +81,19 @@ pub struct JobConfig {
     pub borders: BordersConfig,
     /// Metrics at the borders of cells.
     pub seams: SeamsConfig,
+}
+
+impl Serialize for JobConfig {
+    fn serialize<S: Serializer>(&self, serializer: S) -> std::result::Result<S::Ok, S::Error> {
+        Self::serialize(self, serializer)
+    }
+}
+
+impl<'de> Deserialize<'de> for JobConfig {
+    // However a configuration is read, its method says what its Gaussians are.
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> std::result::Result<Self, D::Error> {
+        Self::deserialize(deserializer).map(Self::with_shape)
+    }
 }
 
 impl JobConfig {
@@ -122,7 +135,7 @@ impl JobConfig {
         numbers::refuse_huge(&given, "").map_err(serde::de::Error::custom)?;
         let mut merged = serde_json::to_value(Self::of_preset(Named::deserialize(&given)?.preset))?;
         overlay(&mut merged, given);
-        serde_json::from_value(merged).map(Self::with_shape)
+        serde_json::from_value(merged)
     }
 }
 

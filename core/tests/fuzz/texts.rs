@@ -66,6 +66,7 @@ fn fuzzed_configurations_are_refused_or_survive_the_store() {
         // The scheduler and workers read a stored job again.
         let stored = serde_json::to_string(&config).unwrap();
         assert_eq!(JobConfig::from_json(&stored).unwrap(), config);
+        assert_eq!(serde_json::from_str::<JobConfig>(&stored).unwrap(), config);
         true
     };
     run(&Target::new("job configuration", corpus, &read));
