@@ -1,4 +1,4 @@
-//@ import frame, splat, exchange, sums
+//@ import frame, splat, votes, exchange, sums
 // Gradients of the blending, for every intersection.
 //
 // With F = sum of v . (contribution of a splat), and `rem` the contributions behind splat i, including the

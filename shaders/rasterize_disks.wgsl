@@ -1,4 +1,4 @@
-//@ import frame, disk, disk_at_pixels, exchange_disks
+//@ import frame, disk, disk_at_pixels, votes, exchange_disks
 // Blends the disks of a tile, front to back, as rasterize_forward does splats.
 //
 //   image   [H*W]   vec4: rgb over the background, alpha = 1 - T

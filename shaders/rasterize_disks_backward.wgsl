@@ -1,4 +1,4 @@
-//@ import frame, disk, disk_at_pixels, exchange_disks, sums_disks
+//@ import frame, disk, disk_at_pixels, votes, exchange_disks, sums_disks
 // Gradients of the blending of disks, for every intersection; see rasterize_backward.
 //
 //   v_pixels [H*W*2] vec4 of gather_pixel_gradients

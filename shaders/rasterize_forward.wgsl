@@ -1,4 +1,4 @@
-//@ import frame, splat, exchange
+//@ import frame, splat, votes, exchange
 // Blends the splats of a tile, front to back (Kerbl et al. 2023, eq. 3).
 //
 //     alpha = min(MAX_ALPHA, opacity exp(-sigma)),  C += alpha T c,  R += alpha T range,  T *= 1 - alpha

@@ -15,8 +15,8 @@ pub struct TileLayout {
     /// Side of a tile, pixels; a multiple of 8.
     pub tile: u32,
     /// Whether the threads of a tile are the lanes of one vector (then `tile` is 8). If so, the imports
-    /// `exchange` and `sums`, also of disks, are the files that end in `_vector`, otherwise those that end in
-    /// `_workgroup`.
+    /// `votes`, `exchange` and `sums`, also those of disks, are the files that end in `_vector`. Otherwise
+    /// they are those that end in `_workgroup`.
     pub vector: bool,
     /// Whether scans and sorts use the files that end in `_subgroups`, where they exist.
     pub subgroups: bool,
@@ -124,7 +124,7 @@ pub fn shader_source(name: &str, layout: TileLayout) -> Result<String> {
                     source.push_str(find(SHARED, file)?);
                 }
             }
-            ("exchange" | "sums" | "exchange_disks" | "sums_disks", None) => {
+            ("votes" | "exchange" | "sums" | "exchange_disks" | "sums_disks", None) => {
                 source.push_str(find(SHARED, &format!("{import}_{kind}"))?)
             }
             (import, None) => source.push_str(find(SHARED, import)?),

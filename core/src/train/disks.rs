@@ -66,6 +66,10 @@ impl DiskMaps {
         weight: f32,
         [v_image, v_range]: [&wgpu::Buffer; 2],
     ) -> Result<()> {
+        if weight <= 0.0 {
+            recorder.clear(&self.v_normal);
+            return Ok(());
+        }
         let targets = frame.targets()?;
         let Some(normal_image) = &targets.normal_image else {
             return Err(CoreError::Gpu("normals need a frame of disks".into()));

@@ -1,7 +1,7 @@
 //! 2D Gaussians: disks, evaluated where the ray of a pixel meets their plane (Huang et al. 2024, "2DGS").
 //!
-//! A disk has a centre, two axes t_u, t_v of unit length and two scales. Its third scale is not used. With
-//! m the centre and o + t d the ray, both in the camera's frame, a_u = t_u / s_u, a_v = t_v / s_v and
+//! A disk has a centre, two axes t_u, t_v of unit length and two scales. Its third scale is not used. Let m
+//! be the centre and o + t d the ray, both in the camera's frame. With a_u = t_u / s_u, a_v = t_v / s_v and
 //! N = a_u x a_v:
 //!
 //! ```text
