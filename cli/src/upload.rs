@@ -37,7 +37,7 @@ pub struct Prepared {
 /// Reads a scene for training and hashes all of its files.
 pub fn prepare(data: &Path, config: &JobConfig) -> Result<Prepared> {
     let scene = load_scene(data, Purpose::Train, &config.data)?;
-    let points = Bytes::from(scene.points.to_bytes());
+    let points = Bytes::from(scene.points.to_bytes_for(config.method));
     let points_ref = BlobRef::of(&points);
     let mut files = vec![(points_ref.clone(), Content::Bytes(points))];
     let progress = Progress::new("reading", scene.views.len() as u64, Unit::Count("photographs"));

@@ -28,6 +28,7 @@ pub mod ply;
 pub mod rng;
 pub mod scene;
 pub mod seams;
+pub mod surface;
 pub mod synth;
 #[cfg(feature = "gpu")]
 pub mod train;

@@ -161,6 +161,8 @@ fn synth_makes_a_pool_and_refuses_flags_of_another_kind() {
     assert_says(&said, &["--ior", "--kind pool"]);
     let (_, said) = fail(&["synth", &out, "--kind", "pool", "--depth", "-1"]);
     assert_says(&said, &["--depth is -1", "0.3 to 5"]);
+    let (_, said) = fail(&["synth", &out, "--kind", "pool", "--length", "1"]);
+    assert_says(&said, &["--length is 1", "2 to 20"]);
     assert!(!Path::new(&out).exists(), "a refused scene leaves nothing");
     let pool = ["synth", &out, "--kind", "pool", "--views", "9", "--size", "64x48", "--depth", "1.2"];
     let made = succeed(&[&pool[..], &["--ior", "1.4", "--json"]].concat());

@@ -27,6 +27,9 @@ pub struct SynthArgs {
     /// Whether to add water between camera and wreck [default: on]
     #[arg(long, value_enum)]
     water: Option<Switch>,
+    /// Length of a pool, metres; it is 2 metres wide [default: 2]
+    #[arg(long, value_name = "METRES", allow_negative_numbers = true)]
+    length: Option<f64>,
     /// Depth of a pool, metres [default: 0.8]
     #[arg(long, value_name = "METRES", allow_negative_numbers = true)]
     depth: Option<f64>,
@@ -72,11 +75,17 @@ impl SynthArgs {
     /// Refuses flags of another kind of scene.
     fn check(&self) -> Result<()> {
         let (given, of, needed) = match self.kind {
-            Kind::Wreck => {
-                ([("--depth", self.depth.is_some()), ("--ior", self.ior.is_some())], "a pool", "pool")
-            }
+            Kind::Wreck => (
+                vec![
+                    ("--length", self.length.is_some()),
+                    ("--depth", self.depth.is_some()),
+                    ("--ior", self.ior.is_some()),
+                ],
+                "a pool",
+                "pool",
+            ),
             Kind::Pool => {
-                ([("--look", self.look.is_some()), ("--water", self.water.is_some())], "a wreck", "wreck")
+                (vec![("--look", self.look.is_some()), ("--water", self.water.is_some())], "a wreck", "wreck")
             }
         };
         match given.into_iter().find(|(_, is_given)| *is_given) {
@@ -95,6 +104,7 @@ impl SynthArgs {
             width: self.size.0,
             height: self.size.1,
             points_per_view: self.points_per_view,
+            length: self.length.unwrap_or(usual.length),
             depth: self.depth.unwrap_or(usual.depth),
             ior: self.ior.unwrap_or(usual.ior),
         }

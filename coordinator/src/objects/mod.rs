@@ -50,7 +50,7 @@ pub use tenants::TenantBlobs;
 pub use writer::BlobWriter;
 
 /// Largest blob that is read into memory, bytes. The largest such blobs are sparse points: 100 million, each
-/// seen by four views.
+/// seen by four views, or 80 million with the pixels.
 const MAX_READ_BYTES: u64 = 4 << 30;
 /// Blobs that are checked at a time: a bucket answers each after milliseconds.
 const CHECKS_AT_ONCE: usize = 32;

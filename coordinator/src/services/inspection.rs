@@ -8,7 +8,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use fathom_core::CoreError;
-use fathom_core::config::{DataConfig, JobConfig};
+use fathom_core::config::{JobConfig, Method};
 use fathom_core::cover::predicted_unseen;
 use fathom_core::scene::{BlobRef, Manifest, ManifestView, Points, Scene, load_foreign_scene};
 use fathom_merge::Files;
@@ -69,7 +69,7 @@ pub async fn inspect(
             manifests::check(&objects, &blob, Some(list)).await?;
             (blob, Vec::new())
         }
-        None => read_scene(&objects, list, config.data.clone()).await?,
+        None => read_scene(&objects, list, &config).await?,
     };
     let place = place().await?;
     let turn = turn_to_read(DESCRIPTION_TAKES * blob.bytes).await;
@@ -114,7 +114,7 @@ pub async fn manifest_of(
     list: Read<FileList>,
     config: &JobConfig,
 ) -> Result<BlobRef, ServiceError> {
-    Ok(read_scene(objects, list, config.data.clone()).await?.0)
+    Ok(read_scene(objects, list, config).await?.0)
 }
 
 /// A place to read a scene.
@@ -129,7 +129,7 @@ async fn place() -> Result<SemaphorePermit<'static>, ServiceError> {
 async fn read_scene(
     objects: &Arc<BlobStore>,
     list: Read<FileList>,
-    config: DataConfig,
+    config: &JobConfig,
 ) -> Result<(BlobRef, Vec<String>), ServiceError> {
     let (mut described_bytes, mut json_bytes, mut all_bytes) = (0_u64, 0_u64, 0_u64);
     let mut files: HashMap<String, BlobRef> = HashMap::new();
@@ -174,15 +174,16 @@ async fn read_scene(
         from.push((path.clone(), objects.path_of(blob)?));
     }
     let (readable, on_disk) = (objects.files(), objects.is_on_disk());
+    let (data, method) = (config.data.clone(), config.method);
     let read = threads::blocking(move || {
         let (_place, _turn) = (place, turn);
         let staged = Staged::new(folder)?;
         for (path, blob) in from {
             staged.add(&path, &*readable, &blob, on_disk)?;
         }
-        let scene = load_foreign_scene(&staged.0, &config).map_err(|error| staged.fault(error))?;
+        let scene = load_foreign_scene(&staged.0, &data).map_err(|error| staged.fault(error))?;
         let warnings = scene.warnings.iter().map(|warning| staged.without_folder(warning)).collect();
-        let (manifest, points) = manifest_and_points(&staged, scene, &files)?;
+        let (manifest, points) = manifest_and_points(&staged, scene, &files, method)?;
         Ok((manifest, points, warnings))
     });
     let read: Result<(Manifest, Vec<u8>, Vec<String>), ServiceError> = read
@@ -246,6 +247,7 @@ fn manifest_and_points(
     staged: &Staged,
     scene: Scene,
     files: &HashMap<String, BlobRef>,
+    method: Method,
 ) -> Result<(Manifest, Vec<u8>), ServiceError> {
     let blob_of = |path: &Path| -> Result<BlobRef, ServiceError> {
         let inside = path.strip_prefix(&staged.0).unwrap_or(path).to_string_lossy().replace('\\', "/");
@@ -265,7 +267,7 @@ fn manifest_and_points(
             pose: view.pose,
         });
     }
-    let points = scene.points.to_bytes();
+    let points = scene.points.to_bytes_for(method);
     let manifest = Manifest {
         format: Manifest::FORMAT,
         source: scene.source.to_owned(),

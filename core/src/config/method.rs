@@ -25,6 +25,14 @@ impl Method {
             Self::Disks => "2dgs",
         }
     }
+
+    /// Whether it looks through a water surface. Its jobs need the pixels where photographs see sparse
+    /// points.
+    pub fn through_surface(self) -> bool {
+        match self {
+            Self::Splats | Self::Disks => false,
+        }
+    }
 }
 
 impl From<Method> for String {

@@ -99,13 +99,6 @@ impl ByteReader {
         Ok(count as usize)
     }
 
-    pub fn skip(&mut self, bytes: u64, what: &dyn Fn() -> String) -> Result<()> {
-        self.require(bytes, what)?;
-        self.file.seek_relative(bytes as i64).map_err(CoreError::io("read", &self.path))?;
-        self.offset += bytes;
-        Ok(())
-    }
-
     /// Refuses bytes after the last entry: they show that the count at the start of the file is wrong.
     pub fn finish(&self, count: usize, entries: &str) -> Result<()> {
         if self.left() == 0 {

@@ -5,7 +5,9 @@ use std::path::{Path, PathBuf};
 
 use super::assemble::{Draft, DraftView};
 use super::camera::MAX_COORDINATE;
-use super::{Camera, Points, Pose, Purpose, Reach, colmap_binary, colmap_text};
+use super::{
+    Camera, PinholeCamera, Place, Points, Pose, Purpose, Reach, Undistortion, colmap_binary, colmap_text,
+};
 use crate::{CoreError, Result};
 
 /// One image as a model lists it.
@@ -16,35 +18,61 @@ pub(super) struct RawImage {
     pub pose: Pose,
     /// Its byte or line in the file.
     pub place: String,
+    /// Its 2D points that belong to a point: index in the file, ascending, and place.
+    pub seen: Vec<(u32, Place)>,
+}
+
+/// Cameras by id, with the way from a pixel of their photographs to a place in the undistorted picture.
+pub(super) struct Lenses(HashMap<u32, Undistortion>);
+
+impl Lenses {
+    /// Cameras that cannot be undistorted are left out.
+    fn of(cameras: &[Camera]) -> Self {
+        Self(cameras.iter().filter_map(|camera| Some((camera.id, camera.undistortion().ok()?))).collect())
+    }
+
+    /// Where the undistorted picture of this camera shows a `pixel` of the photograph.
+    pub fn place(&self, camera_id: u32, [u, v]: [f64; 2]) -> Place {
+        let Some(lens) = self.0.get(&camera_id) else { return Place::UNKNOWN };
+        let PinholeCamera { width, height, .. } = lens.pinhole();
+        lens.result_of(u, v).map_or(Place::UNKNOWN, |pixel| Place::new(pixel, width, height))
+    }
 }
 
 /// Points while they are read.
 pub(super) struct RawPoints<'a> {
     /// Maps the id of an image to the index of its view by name.
     view_of_image: &'a HashMap<u32, u32>,
+    /// By view: [`RawImage::seen`].
+    places: Vec<Vec<(u32, Place)>>,
     pub points: Points,
     /// Points left out because a coordinate is not finite or beyond [`MAX_COORDINATE`].
     not_finite: usize,
     /// Observations left out because the model has no image of that id.
     unknown: usize,
-    track: Vec<u32>,
+    track: Vec<(u32, Place)>,
 }
 
 impl<'a> RawPoints<'a> {
-    fn new(view_of_image: &'a HashMap<u32, u32>) -> Self {
-        Self { view_of_image, points: Points::default(), not_finite: 0, unknown: 0, track: Vec::new() }
+    fn new(view_of_image: &'a HashMap<u32, u32>, places: Vec<Vec<(u32, Place)>>) -> Self {
+        let points = Points::default();
+        Self { view_of_image, places, points, not_finite: 0, unknown: 0, track: Vec::new() }
     }
 
-    /// Records that the image of this id sees the next point.
-    pub fn see(&mut self, image_id: u32) {
-        match self.view_of_image.get(&image_id) {
-            Some(view) => self.track.push(*view),
-            None => self.unknown += 1,
-        }
+    /// Records that the image of this id sees the next point, as its 2D point `index`.
+    pub fn see(&mut self, image_id: u32, index: u32) {
+        let Some(&view) = self.view_of_image.get(&image_id) else {
+            self.unknown += 1;
+            return;
+        };
+        let of_view = self.places.get(view as usize).map_or(&[][..], Vec::as_slice);
+        let place =
+            of_view.binary_search_by_key(&index, |seen| seen.0).map_or(Place::UNKNOWN, |at| of_view[at].1);
+        self.track.push((view, place));
     }
 
     pub fn push(&mut self, position: [f64; 3], colour: [u8; 3]) {
-        if !self.points.push_seen(position, colour, &mut self.track) {
+        if !self.points.push_seen_at(position, colour, &mut self.track) {
             self.not_finite += 1;
         }
         self.track.clear();
@@ -181,17 +209,21 @@ pub(super) fn read(root: &Path, models: &[Model], purpose: Purpose, reach: Reach
     }
 
     let (cameras_file, images_file) = (model.file("cameras"), model.file("images"));
-    let (cameras, mut images): (Vec<Camera>, Vec<RawImage>) = match model.form {
-        Form::Binary => {
-            (colmap_binary::read_cameras(&cameras_file)?, colmap_binary::read_images(&images_file)?)
-        }
-        Form::Text => (colmap_text::read_cameras(&cameras_file)?, colmap_text::read_images(&images_file)?),
+    let cameras: Vec<Camera> = match model.form {
+        Form::Binary => colmap_binary::read_cameras(&cameras_file)?,
+        Form::Text => colmap_text::read_cameras(&cameras_file)?,
+    };
+    let lenses = Lenses::of(&cameras);
+    let mut images: Vec<RawImage> = match model.form {
+        Form::Binary => colmap_binary::read_images(&images_file, &lenses)?,
+        Form::Text => colmap_text::read_images(&images_file, &lenses)?,
     };
     // Ids follow the order in which photographs were added to a database.
     images.sort_by(|a, b| a.name.cmp(&b.name));
     let points_file = model.file("points3D");
     let view_of_image: HashMap<u32, u32> = images.iter().map(|image| image.id).zip(0..).collect();
-    let mut read = RawPoints::new(&view_of_image);
+    let places = images.iter_mut().map(|image| std::mem::take(&mut image.seen)).collect();
+    let mut read = RawPoints::new(&view_of_image, places);
     match (points_file.is_file(), model.form) {
         (true, Form::Binary) => colmap_binary::read_points(&points_file, &mut read)?,
         (true, Form::Text) => colmap_text::read_points(&points_file, &mut read)?,

@@ -1,13 +1,13 @@
 //! COLMAP's `cameras.bin`, `images.bin` and `points3D.bin` (`scene/reconstruction_io_binary.cc`).
 //!
 //! All files are little-endian and start with a u64 count. Rigs and frames (COLMAP 3.12 and later) are
-//! ignored: `images.bin` still holds each image's own pose. 2D points are skipped without being held in
-//! memory; tracks keep only the images.
+//! ignored: `images.bin` still holds each image's own pose. Of the 2D points those that belong to a point are
+//! held in memory until its track is read.
 
 use std::path::Path;
 
 use super::bytes::ByteReader;
-use super::colmap::{RawImage, RawPoints, image_pose};
+use super::colmap::{Lenses, RawImage, RawPoints, image_pose};
 use super::{Camera, CameraModel, Points};
 use crate::Result;
 
@@ -55,7 +55,7 @@ pub(super) fn image_count(path: &Path) -> Result<u64> {
     ByteReader::open(path)?.u64(&|| "the number of images".to_owned())
 }
 
-pub(super) fn read_images(path: &Path) -> Result<Vec<RawImage>> {
+pub(super) fn read_images(path: &Path, lenses: &Lenses) -> Result<Vec<RawImage>> {
     let mut file = ByteReader::open(path)?;
     let count = file.count(73, "images", &|| "the number of images".to_owned())?;
     let mut images = Vec::with_capacity(count);
@@ -70,9 +70,16 @@ pub(super) fn read_images(path: &Path) -> Result<Vec<RawImage>> {
         let pose =
             image_pose(&name, quat_wxyz, translation).map_err(|message| file.fault(start, &message))?;
         let points = || format!("the 2D points of image {} of {count} ({name})", index + 1);
-        let seen = file.count(24, "2D points", &points)?;
-        file.skip(seen as u64 * 24, &points)?;
-        images.push(RawImage { id, name, camera_id, pose, place: format!("byte {start}") });
+        let count = file.count(24, "2D points", &points)?;
+        let mut seen = Vec::new();
+        for index in 0..count {
+            let pixel = file.f64s::<2>(&points)?;
+            let has_point = file.u64(&points)? != u64::MAX;
+            if has_point && let Ok(index) = u32::try_from(index) {
+                seen.push((index, lenses.place(camera_id, pixel)));
+            }
+        }
+        images.push(RawImage { id, name, camera_id, pose, place: format!("byte {start}"), seen });
     }
     file.finish(count, "images")?;
     Ok(images)
@@ -91,8 +98,8 @@ pub(super) fn read_points(path: &Path, into: &mut RawPoints<'_>) -> Result<()> {
         let track = || format!("the track of point {} of {count}", index + 1);
         let seen = file.count(8, "observations", &track)?;
         for _ in 0..seen {
-            let [a, b, c, d, _index_of_2d_point @ ..] = file.bytes::<8>(&track)?;
-            into.see(u32::from_le_bytes([a, b, c, d]));
+            let (image_id, index) = (file.u32(&track)?, file.u32(&track)?);
+            into.see(image_id, index);
         }
         into.push(position, colour);
     }

@@ -8,7 +8,7 @@ use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 use std::str::SplitAsciiWhitespace;
 
-use super::colmap::{RawImage, RawPoints, image_pose};
+use super::colmap::{Lenses, RawImage, RawPoints, image_pose};
 use super::{Camera, CameraModel};
 use crate::{CoreError, Result};
 
@@ -54,7 +54,7 @@ pub(super) fn image_count(path: &Path) -> Result<u64> {
     Ok(count)
 }
 
-pub(super) fn read_images(path: &Path) -> Result<Vec<RawImage>> {
+pub(super) fn read_images(path: &Path, lenses: &Lenses) -> Result<Vec<RawImage>> {
     let mut file = Lines::open(path)?;
     let mut images = Vec::new();
     while let Some(line) = file.next_entry()? {
@@ -81,17 +81,31 @@ pub(super) fn read_images(path: &Path) -> Result<Vec<RawImage>> {
         }
         let [qw, qx, qy, qz, tx, ty, tz] = pose;
         let pose = image_pose(&name, [qw, qx, qy, qz], [tx, ty, tz]).map_err(fault)?;
-        images.push(RawImage { id, name, camera_id, pose, place: format!("line {}", file.number) });
+        let place = format!("line {}", file.number);
+        let mut seen = Vec::new();
         // The line of 2D points, which is missing after the last image if an editor has trimmed the file.
         if let Some(points) = file.next_line()? {
-            let words = points.split_ascii_whitespace().count();
-            if words % 3 != 0 {
+            let mut count = 0;
+            let mut pixel = [f64::NAN; 2];
+            for word in points.split_ascii_whitespace() {
+                match count % 3 {
+                    2 if word.parse::<u64>().is_ok_and(|id| id != u64::MAX) => {
+                        seen.push((count / 3, lenses.place(camera_id, pixel)));
+                    }
+                    2 => {}
+                    // What is no number has no place.
+                    axis => pixel[axis as usize] = parse_float(word).unwrap_or(f64::NAN),
+                }
+                count += 1_u32;
+            }
+            if count % 3 != 0 {
                 return Err(file.fault(&format!(
-                    "{words} numbers of 2D points are not a multiple of three (X Y POINT3D_ID); \
+                    "{count} numbers of 2D points are not a multiple of three (X Y POINT3D_ID); \
                      the file is truncated or the second line of an image is missing"
                 )));
             }
         }
+        images.push(RawImage { id, name, camera_id, pose, place, seen });
     }
     Ok(images)
 }
@@ -112,8 +126,9 @@ pub(super) fn read_points(path: &Path, into: &mut RawPoints<'_>) -> Result<()> {
         }
         let _reprojection_error = words.next();
         while let Some(image_id) = words.next() {
-            into.see(parse_integer(image_id, "the image id of a track").map_err(fault)?);
-            let _index: u32 = number(&mut words, "the 2D point of a track").map_err(fault)?;
+            let image_id = parse_integer(image_id, "the image id of a track").map_err(fault)?;
+            let index = number(&mut words, "the 2D point of a track").map_err(fault)?;
+            into.see(image_id, index);
         }
         into.push(position, colour);
     }

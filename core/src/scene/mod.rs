@@ -32,7 +32,7 @@ pub use orbit::Orbit;
 pub use path::CameraPath;
 pub use points::{extent, learning_scale, viewing_distance};
 pub use real::real_scene_for_test;
-pub use tracks::Tracks;
+pub use tracks::{Place, Tracks};
 pub(crate) use undistort::Undistortion;
 
 use crate::config::DataConfig;

@@ -7,9 +7,16 @@
 //! 16        u64       M, the number of observations
 //! 24        N times   f32 x, f32 y, f32 z, u8 r, u8 g, u8 b    (15 bytes)
 //! 24 + 15N  N times   u32, number of views that see the point; M in total
-//! 24 + 19N  M times   u32 view, index among the views of the scene by name; ascending and unique for each point
+//! 24 + 19N M times u32 view, index among the views of the scene by name; ascending and unique for each point
 //! ```
-//! and for points without tracks (any version of Fathom reads this):
+//! [`Points::to_bytes_with_places`] adds the pixels of the observations, if there are any:
+//! ```text
+//! 0         8 bytes   "FTHMPTS3"
+//! 8                   as above
+//! 24 + 19N + 4M  M times   u16 x, u16 y, shares of the sides in 1/65535; 65535 where they are unknown
+//! ```
+//! [`Points::to_bytes`] leaves them out: programs of version 0.2 do not read them, and what trains without a
+//! water surface does not need them. For points without tracks (any version of Fathom reads this):
 //! ```text
 //! 0         8 bytes   "FTHMPTS1"
 //! 8         u64       N
@@ -20,11 +27,13 @@
 use glam::DVec3;
 
 use super::camera::is_near;
-use super::{PinholeCamera, Points, Pose, Tracks};
+use super::{PinholeCamera, Place, Points, Pose, Tracks};
+use crate::config::Method;
 use crate::{CoreError, Result};
 
 const MAGIC: &[u8; 8] = b"FTHMPTS1";
 const MAGIC_WITH_TRACKS: &[u8; 8] = b"FTHMPTS2";
+const MAGIC_WITH_PLACES: &[u8; 8] = b"FTHMPTS3";
 const HEADER_BYTES: usize = 16;
 const HEADER_WITH_TRACKS_BYTES: usize = 24;
 const POINT_BYTES: usize = 15;
@@ -68,23 +77,56 @@ impl Points {
         pushed
     }
 
+    /// As [`Points::push_seen`], with the place where each view sees the point.
+    pub fn push_seen_at(
+        &mut self,
+        position: [f64; 3],
+        colour: [u8; 3],
+        seen: &mut Vec<(u32, Place)>,
+    ) -> bool {
+        let pushed = self.push(position, colour);
+        if pushed {
+            self.tracks.set_last_seen(self.len() - 1, seen);
+        }
+        pushed
+    }
+
     /// The points with these indices, in this order.
     pub fn select(&self, kept: &[u32]) -> Self {
         let mut points = Self::with_capacity(kept.len());
         for (index, &old) in kept.iter().enumerate() {
             points.positions.push(self.positions[old as usize]);
             points.colours.push(self.colours[old as usize]);
-            points.tracks.set_last(index, &mut self.tracks.of(old as usize).to_vec());
+            points.tracks.set_last_seen(index, &mut self.tracks.seen(old as usize).collect());
         }
         points
     }
 
-    /// The binary format that the head of this file describes.
+    /// The binary format that the head of this file describes, without places.
     pub fn to_bytes(&self) -> Vec<u8> {
+        self.encode(false)
+    }
+
+    /// As [`Points::to_bytes`], with places if there are any.
+    pub fn to_bytes_with_places(&self) -> Vec<u8> {
+        self.encode(self.tracks.have_places())
+    }
+
+    /// The bytes that jobs of this method get: with places if it looks through a water surface.
+    pub fn to_bytes_for(&self, method: Method) -> Vec<u8> {
+        self.encode(method.through_surface() && self.tracks.have_places())
+    }
+
+    fn encode(&self, with_places: bool) -> Vec<u8> {
         let seen = self.tracks.observations();
-        let track_bytes = if seen > 0 { 8 + 4 * (self.len() + seen) } else { 0 };
+        let seen_bytes = if with_places { 8 } else { 4 };
+        let track_bytes = if seen > 0 { 8 + 4 * self.len() + seen_bytes * seen } else { 0 };
         let mut bytes = Vec::with_capacity(HEADER_BYTES + self.len() * POINT_BYTES + track_bytes);
-        bytes.extend_from_slice(if seen > 0 { MAGIC_WITH_TRACKS } else { MAGIC });
+        bytes.extend_from_slice(match (seen > 0, with_places) {
+            (false, _) => MAGIC,
+            (true, false) => MAGIC_WITH_TRACKS,
+            (true, true) => MAGIC_WITH_PLACES,
+        });
         bytes.extend_from_slice(&(self.len() as u64).to_le_bytes());
         if seen > 0 {
             bytes.extend_from_slice(&(seen as u64).to_le_bytes());
@@ -103,21 +145,27 @@ impl Points {
                 bytes.extend_from_slice(&view.to_le_bytes());
             }
         }
+        if with_places {
+            for (_, place) in (0..self.len()).flat_map(|point| self.tracks.seen(point)) {
+                bytes.extend_from_slice(&place.to_bytes());
+            }
+        }
         bytes
     }
 
-    /// The points of [`Points::to_bytes`].
+    /// The points of [`Points::to_bytes`] or [`Points::to_bytes_with_places`].
     ///
     /// # Errors
     /// When the bytes have another layout, are truncated, hold a coordinate that [`Points::push`] refuses, or
     /// a track whose views are not ascending.
     pub fn from_bytes(bytes: &[u8]) -> Result<Self> {
         let refuse = |message: String| CoreError::Scene(format!("sparse points: {message}"));
-        let with_tracks = match bytes.get(..8) {
-            Some(magic) if magic == MAGIC => false,
-            Some(magic) if magic == MAGIC_WITH_TRACKS => true,
+        let (with_tracks, seen_bytes) = match bytes.get(..8) {
+            Some(magic) if magic == MAGIC => (false, 0),
+            Some(magic) if magic == MAGIC_WITH_TRACKS => (true, 4),
+            Some(magic) if magic == MAGIC_WITH_PLACES => (true, 8),
             _ => {
-                return Err(refuse("the bytes do not start with \"FTHMPTS1\" or \"FTHMPTS2\"".to_owned()));
+                return Err(refuse("the bytes do not start with \"FTHMPTS\" and 1, 2 or 3".to_owned()));
             }
         };
         let header_bytes = if with_tracks { HEADER_WITH_TRACKS_BYTES } else { HEADER_BYTES };
@@ -128,24 +176,28 @@ impl Points {
         };
         let body = &bytes[header_bytes..];
         let entry_bytes = POINT_BYTES as u64 + if with_tracks { 4 } else { 0 };
-        let needed =
-            count.checked_mul(entry_bytes).zip(seen.checked_mul(4)).and_then(|(a, b)| a.checked_add(b));
+        let needed = count
+            .checked_mul(entry_bytes)
+            .zip(seen.checked_mul(seen_bytes))
+            .and_then(|(a, b)| a.checked_add(b));
         if needed != Some(body.len() as u64) {
             return Err(refuse(format!(
-                "the header says {count} points of {entry_bytes} bytes and {seen} observations of 4, but {} bytes \
-                 follow",
+                "the header says {count} points of {entry_bytes} bytes and {seen} observations of \
+                 {seen_bytes}, but {} bytes follow",
                 body.len()
             )));
         }
         let count = count as usize;
-        let (places, tracks) = body.split_at(count * POINT_BYTES);
-        let (lengths, mut views) = tracks.split_at(if with_tracks { 4 * count } else { 0 });
+        let (positions, tracks) = body.split_at(count * POINT_BYTES);
+        let (lengths, views) = tracks.split_at(if with_tracks { 4 * count } else { 0 });
+        // As many observations as fit the bytes were checked above.
+        let (mut views, mut places) = views.split_at(if with_tracks { 4 * seen as usize } else { 0 });
         let word = |bytes: &[u8], at: usize| {
             u32::from_le_bytes([bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]])
         };
         let mut points = Self::with_capacity(count);
         let mut track = Vec::new();
-        for (index, entry) in places.chunks_exact(POINT_BYTES).enumerate() {
+        for (index, entry) in positions.chunks_exact(POINT_BYTES).enumerate() {
             let axis = |at: usize| f32::from_bits(word(entry, at));
             let position = [axis(0), axis(4), axis(8)];
             track.clear();
@@ -157,13 +209,20 @@ impl Points {
                     )));
                 }
                 let (own, rest) = views.split_at(track_bytes as usize);
-                track.extend(own.chunks_exact(4).map(|view| word(view, 0)));
+                track.extend(own.chunks_exact(4).map(|view| (word(view, 0), Place::UNKNOWN)));
                 views = rest;
-                if !track.is_sorted_by(|a, b| a < b) {
+                if seen_bytes == 8 {
+                    let (own, rest) = places.split_at(own.len());
+                    for ((_, place), bytes) in track.iter_mut().zip(own.chunks_exact(4)) {
+                        *place = Place::from_bytes([bytes[0], bytes[1], bytes[2], bytes[3]]);
+                    }
+                    places = rest;
+                }
+                if !track.is_sorted_by(|a, b| a.0 < b.0) {
                     return Err(refuse(format!("the views that see point {index} are not ascending")));
                 }
             }
-            if !points.push_seen(position.map(f64::from), [entry[12], entry[13], entry[14]], &mut track) {
+            if !points.push_seen_at(position.map(f64::from), [entry[12], entry[13], entry[14]], &mut track) {
                 return Err(refuse(format!("point {index} is not finite, or too far from the origin")));
             }
         }
@@ -293,6 +352,36 @@ mod tests {
         assert!(refused(lengths, u32::MAX).contains("more than 5"));
         assert!(refused(lengths + 16, 4).contains("point 0 are not ascending"));
         assert!(refused(16, u32::MAX).contains("4294967295 observations"));
+    }
+
+    #[test]
+    fn places_survive_bytes_that_ask_for_them() {
+        let place = |x: f64| Place::new([x, 1.0], 64, 48);
+        let mut points = Points::default();
+        for (x, mut seen) in
+            [(1.0, vec![(7, place(3.5)), (0, Place::UNKNOWN)]), (2.0, vec![]), (3.0, vec![(3, place(9.25))])]
+        {
+            points.push_seen_at([x, 0.5, -x], [x as u8; 3], &mut seen);
+        }
+        let bytes = points.to_bytes_with_places();
+        assert_eq!((&bytes[..8], bytes.len()), (&b"FTHMPTS3"[..], 24 + 3 * 19 + 3 * 8));
+        assert_eq!(Points::from_bytes(&bytes).unwrap(), points);
+        assert_eq!(Points::from_bytes(&bytes).unwrap().to_bytes_with_places(), bytes);
+        for len in 0..bytes.len() {
+            assert!(Points::from_bytes(&bytes[..len]).is_err(), "{len} of {} bytes passed", bytes.len());
+        }
+        // What version 0.2 hashes and reads has the same bytes as without places.
+        let without = points.to_bytes();
+        assert_eq!((&without[..8], without.len()), (&b"FTHMPTS2"[..], 24 + 3 * 19 + 3 * 4));
+        assert!(!Points::from_bytes(&without).unwrap().tracks.have_places());
+        assert_eq!(tracked().to_bytes_with_places(), tracked().to_bytes());
+        for method in Method::ALL {
+            let needed = if method.through_surface() { &bytes } else { &without };
+            assert_eq!(&points.to_bytes_for(method), needed, "{method:?}");
+        }
+        let kept = points.select(&[2, 0]);
+        assert_eq!(kept.tracks.seen(0).collect::<Vec<_>>(), [(3, place(9.25))]);
+        assert_eq!(kept.tracks.seen(1).collect::<Vec<_>>(), [(0, Place::UNKNOWN), (7, place(3.5))]);
     }
 
     #[test]

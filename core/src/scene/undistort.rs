@@ -61,9 +61,9 @@ impl Camera {
             }
             _ => {
                 return Err(CoreError::Scene(format!(
-                    "camera {} has the model {}, which Fathom does not train on; make pinhole pictures first: \
-                     `colmap image_undistorter --image_path IMAGES --input_path MODEL --output_path OUT`, \
-                     then train on OUT",
+                    "camera {} has the model {}, which Fathom does not train on; make pinhole pictures \
+                     first: `colmap image_undistorter --image_path IMAGES --input_path MODEL --output_path \
+                     OUT`, then train on OUT",
                     self.id,
                     self.model.name()
                 )));
@@ -99,6 +99,39 @@ impl Undistortion {
         let inside = u >= 0.0 && v >= 0.0 && u <= f64::from(width) && v <= f64::from(height);
         inside.then_some((u, v))
     }
+
+    /// The inverse of [`Undistortion::source_of`]: the position in the pinhole of the photograph's (`u`,
+    /// `v`). It may be outside the pinhole's picture.
+    ///
+    /// `None` beyond the radius where the model is valid, and where no position is found.
+    pub fn result_of(&self, u: f64, v: f64) -> Option<[f64; 2]> {
+        // Newton doubles the digits in each round; strong lenses need six.
+        const ROUNDS: u32 = 20;
+        /// Of a pixel: less than anything that stores the result can hold.
+        const TOLERANCE_PX: f64 = 1e-6;
+        if self.is_identity() {
+            return Some([u, v]);
+        }
+        let PinholeCamera { fx, fy, cx, cy, .. } = self.pinhole;
+        let (goal_x, goal_y) = ((u - cx) / fx, (v - cy) / fy);
+        let (mut x, mut y) = (goal_x, goal_y);
+        for _ in 0..ROUNDS {
+            let (at_x, at_y) = self.distortion.apply(x, y);
+            let (left_x, left_y) = (goal_x - at_x, goal_y - at_y);
+            if (left_x * fx).hypot(left_y * fy) < TOLERANCE_PX {
+                let valid = x * x + y * y <= self.r2_limit;
+                return valid.then_some([fx * x + cx, fy * y + cy]);
+            }
+            let [[xx, xy], [yx, yy]] = self.distortion.slopes(x, y);
+            let determinant = xx * yy - xy * yx;
+            let (step_x, step_y) =
+                ((yy * left_x - xy * left_y) / determinant, (xx * left_y - yx * left_x) / determinant);
+            // A longer step would leave the part of the model that grows.
+            let scale = (0.5 * (1.0 + x.hypot(y)) / step_x.hypot(step_y)).min(1.0);
+            (x, y) = (x + scale * step_x, y + scale * step_y);
+        }
+        None
+    }
 }
 
 impl Distortion {
@@ -121,6 +154,25 @@ impl Distortion {
             x * factor + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
             y * factor + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
         )
+    }
+
+    /// Derivatives of [`Distortion::apply`]: a row for each of its two results.
+    fn slopes(&self, x: f64, y: f64) -> [[f64; 2]; 2] {
+        let r2 = x * x + y * y;
+        let [k1, k2, k3, k4] = self.numerator;
+        let [d1, d2, d3] = self.denominator;
+        let below = 1.0 + r2 * (d1 + r2 * (d2 + r2 * d3));
+        let factor = self.factor(r2);
+        let above_slope = k1 + r2 * (2.0 * k2 + r2 * (3.0 * k3 + r2 * 4.0 * k4));
+        let below_slope = d1 + r2 * (2.0 * d2 + r2 * 3.0 * d3);
+        // By r^2; r^2 changes by 2x and 2y.
+        let slope = (above_slope - factor * below_slope) / below;
+        let [p1, p2] = self.p;
+        let cross = 2.0 * (slope * x * y + p1 * x + p2 * y);
+        [
+            [factor + 2.0 * slope * x * x + 2.0 * p1 * y + 6.0 * p2 * x, cross],
+            [cross, factor + 2.0 * slope * y * y + 6.0 * p1 * y + 2.0 * p2 * x],
+        ]
     }
 
     /// Walks outwards to the farthest corner of the pinhole until the distorted radius stops growing.
@@ -207,6 +259,36 @@ mod tests {
         for other in same {
             assert_eq!(other.unwrap(), simple);
         }
+    }
+
+    #[test]
+    fn a_pixel_of_a_photograph_returns_from_the_pinhole() {
+        let lens = [900.0, 910.0, 500.0, 400.0, -0.1, 0.02, 0.001, -0.002, 0.003, 0.01, -0.004, 0.002];
+        for (model, params) in [
+            (CameraModel::Pinhole, &[900.0, 910.0, 500.0, 400.0][..]),
+            (CameraModel::SimpleRadial, &[900.0, 500.0, 400.0, -0.2]),
+            (CameraModel::Radial, &[900.0, 500.0, 400.0, 0.12, 0.03]),
+            (CameraModel::Opencv, &lens[..8]),
+            (CameraModel::Opencv, &lens[..10]),
+            (CameraModel::FullOpencv, &lens[..]),
+        ] {
+            let undistortion = camera(model, params).undistortion().unwrap();
+            let mut found = 0;
+            for (u, v) in
+                (0..=20).flat_map(|i| (0..=20).map(move |j| (f64::from(i) * 50.0, f64::from(j) * 40.0)))
+            {
+                let Some((x, y)) = undistortion.source_of(u, v) else { continue };
+                found += 1;
+                let [back_u, back_v] = undistortion.result_of(x, y).unwrap();
+                assert!((back_u - u).hypot(back_v - v) < 1e-5, "{model:?}: {back_u} {back_v} for {u} {v}");
+            }
+            assert!(found > 200, "{model:?}: {found}");
+        }
+        // Beyond the largest distorted radius of this lens, 0.406 of its focal length, no pixel has a place.
+        let strong = camera(CameraModel::SimpleRadial, &[900.0, 500.0, 400.0, -0.9]).undistortion().unwrap();
+        assert!(strong.result_of(500.0 + 0.40 * 900.0, 400.0).is_some());
+        assert!(strong.result_of(500.0 + 0.45 * 900.0, 400.0).is_none());
+        assert!(strong.result_of(f64::NAN, 3.0).is_none());
     }
 
     #[test]

@@ -3,7 +3,7 @@
 use fathom_core::gaussians::Gaussians;
 use fathom_core::nets::{RELEASE_PRIOR, WaterParamNet, WaterParamPredictor};
 use fathom_core::ply;
-use fathom_core::scene::Points;
+use fathom_core::scene::{Place, Points};
 use fathom_fuzz::{Folder, Target, run};
 
 use crate::Bytes;
@@ -102,6 +102,9 @@ fn fuzzed_sparse_points_are_read_or_refused_and_have_one_form() {
     for (x, mut views) in [(1.0, vec![7, 0, 3]), (2.0, vec![]), (3.0, vec![3, 1]), (4.0, vec![])] {
         tracked.push_seen([x, 0.5, -x], [x as u8; 3], &mut views);
     }
+    let mut placed = tracked.clone();
+    let place = |x: f64| Place::new([x, 2.0], 8, 6);
+    placed.push_seen_at([5.0; 3], [5; 3], &mut vec![(2, place(1.5)), (4, place(9.0)), (6, place(3.25))]);
     let mut plain = Points::default();
     for x in 0..5 {
         plain.push([f64::from(x), 0.5, 1.0], [9; 3]);
@@ -109,10 +112,11 @@ fn fuzzed_sparse_points_are_read_or_refused_and_have_one_form() {
     let read = |bytes: &[u8]| {
         let Ok(points) = Points::from_bytes(bytes) else { return false };
         assert!(points.positions.iter().flatten().all(|value| value.is_finite()));
-        assert_eq!(Points::from_bytes(&points.to_bytes()).unwrap(), points);
+        assert_eq!(Points::from_bytes(&points.to_bytes_with_places()).unwrap(), points);
         true
     };
-    run(&Target::new("sparse points", vec![tracked.to_bytes(), plain.to_bytes()], &read));
+    let corpus = vec![tracked.to_bytes(), placed.to_bytes_with_places(), plain.to_bytes()];
+    run(&Target::new("sparse points", corpus, &read));
 }
 
 #[test]

@@ -31,6 +31,9 @@ fn use_scene(scene: &Scene) {
     for point in 0..scene.points.len() {
         let track = scene.points.tracks.of(point);
         assert!(track.iter().all(|view| (*view as usize) < scene.views.len()), "point {point}: {track:?}");
+        for [x, y] in scene.points.tracks.seen(point).filter_map(|(_, place)| place.pixel(48, 36)) {
+            assert!((0.0..48.0).contains(&x) && (0.0..36.0).contains(&y), "point {point}: {x}, {y}");
+        }
     }
 }
 

@@ -1,7 +1,7 @@
 //! Valid and invalid COLMAP models.
 
 use super::fixture::{CameraEntry, Dataset, HEIGHT, Model, WIDTH, assert_says, pinhole, write_png};
-use crate::scene::{CameraModel, Pose, Purpose};
+use crate::scene::{CameraModel, Place, Pose, Purpose};
 
 #[test]
 fn binary_and_text_give_the_same_scene() {
@@ -54,6 +54,48 @@ fn tracks_name_the_views_in_their_order_by_name() {
         std::fs::remove_file(dataset.path("images/a.png")).unwrap();
         assert_eq!(seen_by(&dataset.train()), [vec![], vec![1], vec![0], vec![1]], "a.png is left out");
         assert_eq!(seen_by(&dataset.inspect()), [vec![], vec![2], vec![0, 1], vec![0, 2]], "a.png is kept");
+    }
+}
+
+#[test]
+fn tracks_keep_the_pixels_of_the_undistorted_pictures() {
+    let mut model = Model::sample();
+    let lens =
+        CameraEntry { model: 2, name: "SIMPLE_RADIAL", params: vec![9.0, 4.25, 3.0, -0.1], ..pinhole(4) };
+    model.cameras.push(lens);
+    // "left cam/b 2.png" has a lens; "left cam/c.png" has no such 2D point.
+    model.images[0].camera_id = 4;
+    model.images[0].points2d = vec![([1.0, 1.0], None), ([6.5, 4.75], Some(3)), ([-2.0, 1.0], Some(3))];
+    model.images[1].points2d = vec![([2.125, 5.5], Some(3))];
+    model.points[2].track = vec![10, 11, 12];
+    model.points[2].indices = vec![1, 0, 0];
+    for dataset in [Dataset::binary(&model), Dataset::text(&model)] {
+        let seen = |scene: &crate::scene::Scene| -> Vec<(u32, Option<[f64; 2]>)> {
+            scene.points.tracks.seen(2).map(|(view, place)| (view, place.pixel(WIDTH, HEIGHT))).collect()
+        };
+        let scene = dataset.train();
+        let [(0, Some(plain)), (1, Some(lens)), (2, None)] = seen(&scene)[..] else {
+            panic!("{:?}", seen(&scene));
+        };
+        // Sixteenths of a pixel would be coarser by a thousand: the picture has 8 x 6 pixels.
+        let close = |a: [f64; 2], b: [f64; 2]| (a[0] - b[0]).hypot(a[1] - b[1]) < 1e-4;
+        assert!(close(plain, [2.125, 5.5]), "{plain:?}");
+        let undistortion = scene.camera(4).unwrap().undistortion().unwrap();
+        let (x, y) = undistortion.source_of(lens[0], lens[1]).unwrap();
+        assert!(close([x, y], [6.5, 4.75]), "{lens:?} is shown at {x}, {y}");
+        assert!((lens[0] - 6.5).hypot(lens[1] - 4.75) > 1e-2, "the lens bends: {lens:?}");
+        assert_eq!(scene.points.tracks.seen(1).collect::<Vec<_>>(), [(2, Place::UNKNOWN)]);
+        // Views are renumbered where a photograph is missing.
+        std::fs::remove_file(dataset.path("images/a.png")).unwrap();
+        assert_eq!(seen(&dataset.train()), [(0, Some(lens)), (1, None)]);
+    }
+    model.images[0].points2d = vec![([9.5, 1.0], Some(3)), ([f64::NAN, 1.0], Some(3))];
+    model.images[1].points2d.clear();
+    for index in [0, 1] {
+        model.points[2].indices[0] = index;
+        for dataset in [Dataset::binary(&model), Dataset::text(&model)] {
+            assert!(!dataset.train().points.tracks.have_places(), "2D point {index} is outside the picture");
+        }
     }
 }
 

@@ -28,7 +28,8 @@ pub struct ImageEntry {
     pub translation: [f64; 3],
     pub camera_id: u32,
     pub name: String,
-    pub points2d: u64,
+    /// Pixels, and the ids of their points.
+    pub points2d: Vec<([f64; 2], Option<u64>)>,
 }
 
 #[derive(Clone)]
@@ -37,6 +38,15 @@ pub struct PointEntry {
     pub colour: [u8; 3],
     /// Ids of images.
     pub track: Vec<u32>,
+    /// The 2D point of the images in the same order; missing ones are a 2D point that no image has.
+    pub indices: Vec<u32>,
+}
+
+impl PointEntry {
+    fn seen(&self) -> impl Iterator<Item = (u32, u32)> {
+        let index = |at: usize| self.indices.get(at).copied().unwrap_or(7);
+        self.track.iter().enumerate().map(move |(at, &image_id)| (image_id, index(at)))
+    }
 }
 
 /// A valid model that tests damage.
@@ -56,12 +66,13 @@ impl Model {
             translation: [i as f64 * 0.5, -1.25, 2.0],
             camera_id: 3,
             name: names[i].to_owned(),
-            points2d: [2, 0, 1][i],
+            points2d: vec![([1.5, 2.5], None); [2, 0, 1][i]],
         });
         let points = (0..4_u32).map(|i| PointEntry {
             position: [f64::from(i) * 0.25, 1.5, -2.0],
             colour: [i as u8, 128, 255],
             track: [vec![], vec![12], vec![10, 11], vec![]][i as usize].clone(),
+            indices: Vec::new(),
         });
         Self { cameras: vec![pinhole(3)], images: images.collect(), points: points.collect() }
     }
@@ -90,8 +101,11 @@ impl Model {
             out.extend(image.camera_id.to_le_bytes());
             out.extend(image.name.as_bytes());
             out.push(0);
-            out.extend(image.points2d.to_le_bytes());
-            out.extend(std::iter::repeat_n(7, image.points2d as usize * 24));
+            out.extend((image.points2d.len() as u64).to_le_bytes());
+            for (pixel, point) in &image.points2d {
+                pixel.iter().for_each(|value| out.extend(value.to_le_bytes()));
+                out.extend(point.unwrap_or(u64::MAX).to_le_bytes());
+            }
         }
         out
     }
@@ -104,9 +118,9 @@ impl Model {
             out.extend(point.colour);
             out.extend(0.5_f64.to_le_bytes());
             out.extend((point.track.len() as u64).to_le_bytes());
-            for image_id in &point.track {
+            for (image_id, index) in point.seen() {
                 out.extend(image_id.to_le_bytes());
-                out.extend(7_u32.to_le_bytes());
+                out.extend(index.to_le_bytes());
             }
         }
         out
@@ -135,7 +149,9 @@ impl Model {
             let numbers: Vec<String> =
                 image.quat_wxyz.iter().chain(&image.translation).map(f64::to_string).collect();
             out.push_str(&format!("{} {} {} {}\n", image.id, numbers.join(" "), image.camera_id, image.name));
-            out.push_str(&vec!["1.5 2.5 -1"; image.points2d as usize].join(" "));
+            for ([x, y], point) in &image.points2d {
+                out.push_str(&format!("{x} {y} {} ", point.map_or("-1".to_owned(), |id| id.to_string())));
+            }
             out.push('\n');
         }
         out
@@ -143,10 +159,10 @@ impl Model {
 
     pub fn points_txt(&self) -> String {
         let mut out = "# Point list\n".to_owned();
-        for (id, PointEntry { position: [x, y, z], colour: [r, g, b], track }) in
-            self.points.iter().enumerate()
-        {
-            let track: String = track.iter().map(|image_id| format!(" {image_id} 7")).collect();
+        for (id, point) in self.points.iter().enumerate() {
+            let PointEntry { position: [x, y, z], colour: [r, g, b], .. } = point;
+            let track: String =
+                point.seen().map(|(image_id, index)| format!(" {image_id} {index}")).collect();
             out.push_str(&format!("{} {x} {y} {z} {r} {g} {b} 0.5{track}\n", id + 1));
         }
         out

@@ -15,7 +15,6 @@
 //! Pictures are 8-bit sRGB without noise.
 
 mod hall;
-mod optics;
 mod points;
 #[cfg(test)]
 mod tests;
@@ -33,15 +32,18 @@ use super::{
 };
 use crate::rng::{Stream, uniform_at};
 use crate::scene::{PinholeCamera, Pose};
+use crate::surface::{AIR, Surface};
 use crate::{CoreError, Result};
-use optics::{AIR, Surface};
+use hall::Basin;
 
 /// Refractive index of the `oil` truth.
 pub const OIL: f64 = 1.46;
 /// Rays per pixel and axis.
 const SUPERSAMPLE: u32 = 2;
-/// Rings of cameras: height above the water and distance from the middle, metres.
+/// Rings of cameras around a middle: height above the water and distance from the middle, metres.
 const RINGS: [[f64; 2]; 3] = [[0.8, 1.7], [1.3, 1.5], [1.9, 1.15]];
+/// Length of basin that one middle serves, metres.
+const MIDDLES_APART: f64 = 2.0;
 /// Pictures of the truth.
 const TRUTH: [&str; 4] = ["dry", "oil", "reflected", "refracted"];
 
@@ -58,6 +60,8 @@ pub struct PoolOptions {
     pub height: u32,
     /// Pixels of each photograph where a sparse point is tried. Fewer become points.
     pub points_per_view: u32,
+    /// Length of the basin, metres; it is 2 metres wide.
+    pub length: f64,
     /// Depth of the water, metres.
     pub depth: f64,
     /// Refractive index of the water; that of air is 1.000293.
@@ -66,13 +70,25 @@ pub struct PoolOptions {
 
 impl Default for PoolOptions {
     fn default() -> Self {
-        Self { seed: 1, views: 72, width: 240, height: 180, points_per_view: 90, depth: 0.8, ior: 1.333 }
+        Self {
+            seed: 1,
+            views: 72,
+            width: 240,
+            height: 180,
+            points_per_view: 90,
+            length: 2.0,
+            depth: 0.8,
+            ior: 1.333,
+        }
     }
 }
 
 impl PoolOptions {
     fn validate(&self) -> Result<()> {
         super::validate_sizes(self.views, self.width, self.height, self.points_per_view)?;
+        if !(2.0..=20.0).contains(&self.length) {
+            return Err(CoreError::Config(format!("--length is {}; it must be 2 to 20 metres", self.length)));
+        }
         if !(0.3..=5.0).contains(&self.depth) {
             return Err(CoreError::Config(format!("--depth is {}; it must be 0.3 to 5 metres", self.depth)));
         }
@@ -85,8 +101,9 @@ impl PoolOptions {
         Ok(())
     }
 
-    fn surface(&self) -> Surface {
-        Surface { y: hall::SURFACE_Y, ior: self.ior }
+    fn water(&self) -> Water {
+        let surface = Surface { normal: DVec3::NEG_Y, offset: -hall::SURFACE_Y, ior: self.ior };
+        Water { surface, basin: Basin::new(self.length, self.depth) }
     }
 }
 
@@ -103,13 +120,14 @@ pub fn synthesise_pool(
     options.validate()?;
     let maps = TRUTH.iter().chain(&["region"]).map(|name| format!("truth/{name}"));
     super::new_folders(out, maps)?;
-    let (world, surface) = (hall::build(options.depth, options.seed), options.surface());
+    let water = options.water();
+    let world = hall::build(&water.basin, options.seed);
     let camera = survey::camera(options.width, options.height);
-    let poses = poses(options.views, options.seed);
+    let poses = poses(options);
     let names: Vec<String> = (1..=poses.len()).map(|n| format!("v{n:04}.png")).collect();
     let done = AtomicU32::new(0);
     let take = |view: usize| {
-        let photograph = Photograph::take(&world, &surface, &camera, &poses[view], view, options);
+        let photograph = Photograph::take(&world, &water, &camera, &poses[view], view, options);
         let save = |folder: &str, picture: &RgbImage| {
             let path = out.join(folder).join(&names[view]);
             picture.save(&path).map_err(|error| unwritable(&path, &error))
@@ -126,7 +144,7 @@ pub fn synthesise_pool(
         Ok(photograph)
     };
     let photographs = (0..poses.len()).into_par_iter().map(take).collect::<Result<Vec<_>>>()?;
-    let points = points::sparse_points(&world, &surface, &camera, &poses, &photographs, options);
+    let points = points::sparse_points(&world, &water, &camera, &poses, &photographs, options);
     files::write_colmap(&out.join("sparse/0"), &camera, &names, &poses, &points)?;
     let depths: Vec<_> = (0..poses.len())
         .into_par_iter()
@@ -134,17 +152,17 @@ pub fn synthesise_pool(
         .map(|view| (format!("v{:04}", view + 1), depth_map(&world, &camera, &poses[view])))
         .collect();
     files::write_npz(&out.join("truth/depth_m.npz"), options.width, options.height, &depths)?;
-    files::write(&out.join("truth/surface.json"), surface_json(&surface).as_bytes())?;
+    files::write(&out.join("truth/surface.json"), surface_json(&water).as_bytes())?;
     Ok(SynthSummary { views: options.views, truth_views: depths.len() as u32, points: points.len() as u32 })
 }
 
-fn surface_json(surface: &Surface) -> String {
-    let [x, z] = hall::HALF;
+fn surface_json(Water { surface, basin }: &Water) -> String {
+    let [x, z] = basin.half;
     let values = serde_json::json!({
         "image_formation": "I = F*R + (1-F)*T where a ray meets the water, linear light; F: Fresnel, unpolarised",
-        "normal": [0.0, -1.0, 0.0],
+        "normal": surface.normal.to_array(),
         // Of the plane normal . x = offset, scene axes; the normal points into the air.
-        "offset": -surface.y,
+        "offset": surface.offset,
         "ior": surface.ior,
         "ior_of_air": AIR,
         "ior_of_oil": OIL,
@@ -156,26 +174,35 @@ fn surface_json(surface: &Surface) -> String {
     format!("{values:#}\n")
 }
 
-/// Cameras in rings around the pool, looking down into it.
-fn poses(count: u32, seed: u32) -> Vec<Pose> {
+/// Cameras in rings around the middles of the pool, looking down into it. The first photographs are those
+/// around the first middle, and so on.
+fn poses(options: &PoolOptions) -> Vec<Pose> {
+    let PoolOptions { seed, views, length, .. } = *options;
     let random = |view: u32, k: u32| f64::from(uniform_at(seed, Stream::Synth, 10_000 + view, k)) - 0.5;
     let rings = RINGS.len() as u32;
-    let pose = |view: u32| {
+    let middles = (length / MIDDLES_APART).round().max(1.0) as u32;
+    let first_of = |middle: u32| (u64::from(views) * u64::from(middle) / u64::from(middles)) as u32;
+    let pose = |middle: u32, view: u32| {
+        let (first, end) = (first_of(middle), first_of(middle + 1));
+        let along = length * ((f64::from(middle) + 0.5) / f64::from(middles) - 0.5);
         // Neighbours in the list are in different rings, so that each ring has views of the truth.
-        let ([height, distance], step) = (RINGS[(view % rings) as usize], view / rings);
-        let steps = count.div_ceil(rings);
+        let ([height, distance], step) = (RINGS[(view % rings) as usize], (view - first) / rings);
+        let steps = (end - first).div_ceil(rings);
         let angle = std::f64::consts::TAU
             * (f64::from(step) + f64::from(view % rings) / f64::from(rings) + 0.4 * random(view, 0))
             / f64::from(steps);
         let eye = DVec3::new(
-            distance * angle.cos(),
+            along + distance * angle.cos(),
             hall::SURFACE_Y - height + 0.1 * random(view, 1),
             distance * angle.sin(),
         );
-        let target = DVec3::new(0.5 * random(view, 2), 0.3, 0.5 * random(view, 3));
+        let target = DVec3::new(along + 0.5 * random(view, 2), 0.3, 0.5 * random(view, 3));
         Pose::looking_at(eye, target, DVec3::Y)
     };
-    (0..count).map(pose).collect()
+    (0..middles)
+        .flat_map(|middle| (first_of(middle)..first_of(middle + 1)).map(move |view| (middle, view)))
+        .map(|(middle, view)| pose(middle, view))
+        .collect()
 }
 
 /// One view: the output of the sensor, and of a held-out view its ground truth.
@@ -197,31 +224,44 @@ struct Shown {
     is_wet: bool,
 }
 
-fn shown(world: &World, surface: &Surface, ray: &Ray, seed: u32) -> Shown {
+/// The water in its basin.
+struct Water {
+    surface: Surface,
+    basin: Basin,
+}
+
+impl Water {
+    /// Where a ray from the air meets the water: range and place.
+    fn meets(&self, ray: &Ray) -> Option<(f64, DVec3)> {
+        let range = self.surface.meets(ray.origin, ray.direction)?;
+        let place = ray.origin + ray.direction * range;
+        self.basin.holds(place).then_some((range, place))
+    }
+}
+
+fn shown(world: &World, water: &Water, ray: &Ray, seed: u32) -> Shown {
     let hit = world.hit(ray, 30.0);
     let dry = hit.as_ref().map_or(DVec3::ZERO, |hit| hall::radiance(hit, seed));
-    let meets = surface.meets(ray).filter(|&range| {
-        hall::is_in_basin(ray.origin + ray.direction * range) && hit.is_none_or(|hit| range < hit.range)
-    });
-    let Some(range) = meets else {
+    let meets = water.meets(ray).filter(|&(range, _)| hit.is_none_or(|hit| range < hit.range));
+    let Some((_, origin)) = meets else {
         return Shown { seen: dry, truth: [dry, dry, DVec3::ZERO, DVec3::ZERO], is_wet: false };
     };
     let under = |surface: &Surface| {
-        let split = surface.split(ray, range);
-        let reflected = hall::seen(world, &split.reflected, seed);
-        let refracted = hall::seen(world, &split.refracted, seed);
+        let split = surface.split(ray.direction);
+        let seen = |direction: DVec3| hall::seen(world, &Ray { origin, direction }, seed);
+        let (reflected, refracted) = (seen(split.reflected), seen(split.refracted));
         let seen = split.reflectance * reflected + (1.0 - split.reflectance) * refracted;
         (seen, reflected, refracted)
     };
-    let (seen, reflected, refracted) = under(surface);
-    let (oil, ..) = under(&Surface { ior: OIL, ..*surface });
+    let (seen, reflected, refracted) = under(&water.surface);
+    let (oil, ..) = under(&Surface { ior: OIL, ..water.surface });
     Shown { seen, truth: [dry, oil, reflected, refracted], is_wet: true }
 }
 
 impl Photograph {
     fn take(
         world: &World,
-        surface: &Surface,
+        water: &Water,
         camera: &PinholeCamera,
         pose: &Pose,
         view: usize,
@@ -243,7 +283,7 @@ impl Photograph {
                     let pixel =
                         [f64::from(x) + offset(sub % SUPERSAMPLE), f64::from(y) + offset(sub / SUPERSAMPLE)];
                     let ray = Ray { origin, direction: pixel_ray(camera, pose, pixel) };
-                    let shown = shown(world, surface, &ray, options.seed);
+                    let shown = shown(world, water, &ray, options.seed);
                     seen += shown.seen;
                     sums.iter_mut().zip(shown.truth).for_each(|(sum, one)| *sum += one);
                     wet += u32::from(shown.is_wet);
@@ -262,6 +302,6 @@ impl Photograph {
                 truth.region.put_pixel(x, y, Luma([if wet == rays { 255 } else { 0 }]));
             }
         }
-        Self { pixels, truth: (view.is_multiple_of(TRUTH_EVERY)).then_some(truth) }
+        Self { pixels, truth: view.is_multiple_of(TRUTH_EVERY).then_some(truth) }
     }
 }

@@ -7,9 +7,7 @@ use rayon::prelude::*;
 use super::super::geometry::{Ray, World};
 use super::super::points::{ERROR_PX, SparsePoint, project};
 use super::super::{normal_numbers, pixel_ray};
-use super::hall;
-use super::optics::Surface;
-use super::{Photograph, PoolOptions};
+use super::{Photograph, PoolOptions, Water};
 use crate::rng::{Stream, random_bits, uniform};
 use crate::scene::{PinholeCamera, Pose};
 
@@ -23,7 +21,7 @@ const MOST_REFLECTED: f64 = 0.5;
 /// The points; `photographs` give their colours.
 pub(super) fn sparse_points(
     world: &World,
-    surface: &Surface,
+    water: &Water,
     camera: &PinholeCamera,
     poses: &[Pose],
     photographs: &[Photograph],
@@ -36,14 +34,14 @@ pub(super) fn sparse_points(
         let random = random_bits(seed, Stream::Synth, 20_000 + view, index).map(|b| f64::from(uniform(b)));
         let pixel = [random[0] * f64::from(camera.width), random[1] * f64::from(camera.height)];
         let ray = Ray { origin: pose.centre(), direction: pixel_ray(camera, pose, pixel) };
-        let (point, is_wet) = found(world, surface, &ray)?;
+        let (point, is_wet) = found(world, water, &ray)?;
         let pixels = (0_u32..).zip(poses).filter_map(|(other, pose)| {
             Some((
                 other,
                 if is_wet {
-                    refracted(world, surface, camera, pose, point)?
+                    refracted(world, water, camera, pose, point)?
                 } else {
-                    dry(world, surface, camera, pose, point)?
+                    dry(world, water, camera, pose, point)?
                 },
             ))
         });
@@ -69,21 +67,18 @@ pub(super) fn sparse_points(
 }
 
 /// The surface point that a detector finds along a ray, and whether it is seen through the water.
-fn found(world: &World, surface: &Surface, ray: &Ray) -> Option<(DVec3, bool)> {
+fn found(world: &World, water: &Water, ray: &Ray) -> Option<(DVec3, bool)> {
     let end = |ray: &Ray| world.hit(ray, 30.0).map(|hit| (hit.range, ray.origin + ray.direction * hit.range));
     let hit = end(ray);
-    let meets = surface.meets(ray).filter(|&range| {
-        hall::is_in_basin(ray.origin + ray.direction * range)
-            && hit.is_none_or(|(nearest, _)| range < nearest)
-    });
+    let meets = water.meets(ray).filter(|&(range, _)| hit.is_none_or(|(nearest, _)| range < nearest));
     match meets {
         None => hit.map(|(_, point)| (point, false)),
-        Some(range) => {
-            let split = surface.split(ray, range);
+        Some((_, origin)) => {
+            let split = water.surface.split(ray.direction);
             if split.reflectance > MOST_REFLECTED {
                 return None;
             }
-            end(&split.refracted).map(|(_, point)| (point, true))
+            end(&Ray { origin, direction: split.refracted }).map(|(_, point)| (point, true))
         }
     }
 }
@@ -91,31 +86,24 @@ fn found(world: &World, surface: &Surface, ray: &Ray) -> Option<(DVec3, bool)> {
 /// Where a camera sees a point through the water, if it does.
 fn refracted(
     world: &World,
-    surface: &Surface,
+    water: &Water,
     camera: &PinholeCamera,
     pose: &Pose,
     point: DVec3,
 ) -> Option<[f64; 2]> {
     let eye = pose.centre();
-    let crossing = surface.crossing(eye, point);
+    let crossing = water.surface.crossing(eye, point)?.at;
     let pixel = project(camera, pose, crossing)?;
-    let ray = Ray { origin: eye, direction: (crossing - eye).normalize() };
-    let is_clear = hall::is_in_basin(crossing) && world.sees(eye, crossing) && world.sees(crossing, point);
-    let reflectance = surface.split(&ray, (crossing - eye).length()).reflectance;
+    let is_clear = water.basin.holds(crossing) && world.sees(eye, crossing) && world.sees(crossing, point);
+    let reflectance = water.surface.split((crossing - eye).normalize()).reflectance;
     (is_clear && reflectance <= MOST_REFLECTED).then_some(pixel)
 }
 
 /// Where a camera sees a point in air, if it does.
-fn dry(
-    world: &World,
-    surface: &Surface,
-    camera: &PinholeCamera,
-    pose: &Pose,
-    point: DVec3,
-) -> Option<[f64; 2]> {
+fn dry(world: &World, water: &Water, camera: &PinholeCamera, pose: &Pose, point: DVec3) -> Option<[f64; 2]> {
     let eye = pose.centre();
     let pixel = project(camera, pose, point)?;
-    (point.y < surface.y && world.sees(eye, point)).then_some(pixel)
+    (water.surface.height(point) > 0.0 && world.sees(eye, point)).then_some(pixel)
 }
 
 /// The point with the least squares of distances from the straight rays of its track, refined once by the

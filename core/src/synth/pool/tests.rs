@@ -54,7 +54,21 @@ fn a_pool_has_the_same_bytes_on_any_number_of_threads() {
 
 #[test]
 fn the_truth_of_a_pool_explains_its_photographs() {
-    let folder = made(&small());
+    truth_explains_photographs(&small());
+}
+
+#[test]
+fn the_truth_of_a_long_pool_explains_its_photographs() {
+    let options = PoolOptions { length: 6.0, views: 24, ..small() };
+    let folder = truth_explains_photographs(&options);
+    let surface = std::fs::read(folder.path().join("truth/surface.json")).unwrap();
+    let surface: serde_json::Value = serde_json::from_slice(&surface).unwrap();
+    assert_eq!(surface["half_size"], serde_json::json!([3.0, 1.0]));
+}
+
+/// The folder of a pool whose photographs were compared with their truth.
+fn truth_explains_photographs(options: &PoolOptions) -> tempfile::TempDir {
+    let folder = made(options);
     for view in ["v0001.png", "v0009.png", "v0017.png"] {
         let picture = |kind: &str| colours(folder.path(), &format!("{kind}/{view}"));
         let region = image::open(folder.path().join("truth/region").join(view)).unwrap().to_luma8();
@@ -89,6 +103,29 @@ fn the_truth_of_a_pool_explains_its_photographs() {
         }
         assert!(outside * 50 < count, "{view}: {outside} of {count} values are not between R and T");
     }
+    folder
+}
+
+#[test]
+fn cameras_and_points_fill_the_whole_length_of_a_pool() {
+    let options = PoolOptions { length: 6.0, views: 36, ..small() };
+    let folder = made(&options);
+    let scene = load_scene(folder.path(), Purpose::Train, &DataConfig::default()).unwrap();
+    // Of each metre of the length: how many cameras are there, and how many points of the water.
+    let part = |x: f64| (x + 3.0) as usize;
+    let (mut cameras, mut points) = ([0; 6], [0; 6]);
+    for view in &scene.views {
+        let at = view.pose.centre();
+        assert!(at.x.abs() < 4.0 && at.y < -0.5, "a camera is at {at}");
+        cameras[part(at.x).min(5)] += 1;
+    }
+    for &[x, y, z] in &scene.points.positions {
+        if y > 0.2 && x.abs() < 3.0 && z.abs() < 1.0 {
+            points[part(x.into())] += 1;
+        }
+    }
+    assert!(cameras.iter().all(|count| *count >= 2), "cameras: {cameras:?}");
+    assert!(points.iter().all(|count| *count >= 5), "points: {points:?}");
 }
 
 #[test]
@@ -97,12 +134,13 @@ fn points_in_the_water_come_out_too_high_and_less_exact() {
     let folder = made(&options);
     let scene = load_scene(folder.path(), Purpose::Train, &DataConfig::default()).unwrap();
     assert_eq!(scene.views.len(), 36);
-    let (world, surface) = (hall::build(options.depth, options.seed), options.surface());
+    let water = options.water();
+    let world = hall::build(&water.basin, options.seed);
     let camera = survey::camera(options.width, options.height);
-    let poses = poses(options.views, options.seed);
-    let take = |view: usize| Photograph::take(&world, &surface, &camera, &poses[view], view, &options);
+    let poses = poses(&options);
+    let take = |view: usize| Photograph::take(&world, &water, &camera, &poses[view], view, &options);
     let photographs: Vec<_> = (0..poses.len()).into_par_iter().map(take).collect();
-    let points = points::sparse_points(&world, &surface, &camera, &poses, &photographs, &options);
+    let points = points::sparse_points(&world, &water, &camera, &poses, &photographs, &options);
     let middle = |mut values: Vec<f64>| {
         values.sort_by(f64::total_cmp);
         values[values.len() / 2]
@@ -133,6 +171,7 @@ fn options_out_of_range_are_refused_by_name() {
     };
     assert!(said(PoolOptions { depth: 0.0, ..small() }).contains("--depth is 0"));
     assert!(said(PoolOptions { depth: f64::NAN, ..small() }).contains("--depth"));
+    assert!(said(PoolOptions { length: 1.9, ..small() }).contains("--length is 1.9"));
     assert!(said(PoolOptions { ior: 0.9, ..small() }).contains("--ior is 0.9"));
     assert!(said(PoolOptions { views: 1, ..small() }).contains("--views is 1"));
 }
