@@ -1,12 +1,15 @@
-//@ import frame, gaussian, projection, reach
+//@ import frame, gaussian, projection, place, reach
 //@ variant cull reach=reach_splat
-//@ variant cull_disks reach=outline+reach_disk
+//@ variant cull_disks reach=side_any+outline+reach_disk
+//@ variant cull_reflected reach=surface+side_above+outline+reach_disk
+//@ variant cull_refracted reach=surface+outline+reach_refracted
 // Marks the Gaussians that a view may see.
 //
 // The test bounds the projected box without a covariance. The standard deviation of a splat in pixels is at
 // most f/z * sqrt(1 + u^2 + v^2) * max scale, plus that of the low-pass. Guards are phrased positively, so
 // NaN fails them. The 2D part of frame.mip_filter only makes splats fainter; the 3D part also widens them
-// here. Chunks that cull_chunks rejected are skipped.
+// here. A water surface hides the disks above it from refracted rays, and those below from reflected ones.
+// Chunks that cull_chunks rejected are skipped.
 // One thread per Gaussian; flags [gaussians] are 0 or 1 and are scanned next.
 // Twin: none of its own; the kernel test compares the visible set of the frame with
 // core/twins/src/project_forward.rs.
@@ -32,12 +35,12 @@ fn may_be_seen(i: u32) -> bool {
     }
     let finite = is_finite(m.x) && is_finite(m.y) && is_finite(m.z) && is_finite(norm2) && is_finite(max_scale)
         && is_finite(log_scale.x) && is_finite(log_scale.y) && is_finite(log_scale.z) && is_finite(mean_opacity.w);
-    if !(finite && m.z > NEAR && opacity >= MIN_ALPHA && norm2 > 0.0) {
+    if !(finite && opacity >= MIN_ALPHA && norm2 > 0.0) {
         return false;
     }
-    let reach = reach_of(frame, m, max_scale, sqrt(2.0 * max(log(255.0 * opacity), 0.0)));
-    let mean2d = frame.focal * m.xy / m.z + frame.principal;
-    return all(mean2d + reach > frame.rect_min) && all(mean2d - reach < frame.rect_max);
+    let place = place_of(frame, mean_opacity.xyz, m, max_scale, sqrt(2.0 * max(log(255.0 * opacity), 0.0)));
+    return place.is_ahead && all(place.at + place.reach > frame.rect_min)
+        && all(place.at - place.reach < frame.rect_max);
 }
 
 @compute @workgroup_size(64)

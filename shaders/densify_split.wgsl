@@ -12,7 +12,8 @@
 
 struct Split {
     count: u32,
-    pad0: u32,
+    // 2 for disks: the third number of a disk is not a scale.
+    axes: u32,
     pad1: u32,
     pad2: u32,
 }
@@ -41,7 +42,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     var longest = vec3<f32>(1.0, 0.0, 0.0);
     var reach = log_scale.x;
     if log_scale.y > reach { axis = rot[1]; longest = vec3<f32>(0.0, 1.0, 0.0); reach = log_scale.y; }
-    if log_scale.z > reach { axis = rot[2]; longest = vec3<f32>(0.0, 0.0, 1.0); reach = log_scale.z; }
+    if split.axes == 3u && log_scale.z > reach { axis = rot[2]; longest = vec3<f32>(0.0, 0.0, 1.0); reach = log_scale.z; }
     let offset = axis * (exp(reach) * 0.70710678);
     let child_scale = log_scale - 0.34657359 * longest;
     let opacity = clamp(sigmoid(t0.w), 1e-6, 0.9999);

@@ -12,7 +12,8 @@
 @group(0) @binding(4) var<storage, read> v_image: array<vec4<f32>>;
 @group(0) @binding(5) var<storage, read> v_range_image: array<f32>;
 @group(0) @binding(6) var<storage, read> v_normal_image: array<vec4<f32>>;
-@group(0) @binding(7) var<storage, read_write> v_pixels: array<vec4<f32>>;
+@group(0) @binding(7) var<storage, read> v_mask_image: array<f32>;
+@group(0) @binding(8) var<storage, read_write> v_pixels: array<vec4<f32>>;
 
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
@@ -27,7 +28,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let v_normal = v_normal_image[i].xyz;
     // dot(seen.rgb, v) already includes the background's share T bg . v; alpha = 1 - T.
     let rem = dot(seen.xyz, v.xyz) + range_image[i] * v_range + dot(normal_image[i].xyz, v_normal)
-        - (1.0 - seen.w) * v.w;
+        + normal_image[i].w * v_mask_image[i] - (1.0 - seen.w) * v.w;
     v_pixels[2u * i] = vec4<f32>(v.xyz, rem);
     v_pixels[2u * i + 1u] = vec4<f32>(v_normal, v_range);
 }

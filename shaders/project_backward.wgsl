@@ -1,20 +1,48 @@
 //@ import frame, counters, gaussian, projection, harmonics, water, random, shape, adam, gather, moments
-//@ variant project_backward shape=splat+pull_splat moments=moments_compact
+//@ variant project_backward projection=projection+sight_eye
+//@ variant project_backward shape=splat+pull_splat
+//@ variant project_backward moments=moments_compact
 //@ variant project_backward gather=splat_rows+gather_slots+gradient_of_slots
-//@ variant project_backward_f32 shape=splat+pull_splat moments=moments_f32
+//@ variant project_backward_f32 projection=projection+sight_eye
+//@ variant project_backward_f32 shape=splat+pull_splat
+//@ variant project_backward_f32 moments=moments_f32
 //@ variant project_backward_f32 gather=splat_rows+gather_slots+gradient_of_slots
-//@ variant project_backward_bands shape=splat+pull_splat moments=moments_compact
+//@ variant project_backward_bands projection=projection+sight_eye
+//@ variant project_backward_bands shape=splat+pull_splat
+//@ variant project_backward_bands moments=moments_compact
 //@ variant project_backward_bands gather=splat_sums+gradient_of_bands
-//@ variant project_backward_bands_f32 shape=splat+pull_splat moments=moments_f32
+//@ variant project_backward_bands_f32 projection=projection+sight_eye
+//@ variant project_backward_bands_f32 shape=splat+pull_splat
+//@ variant project_backward_bands_f32 moments=moments_f32
 //@ variant project_backward_bands_f32 gather=splat_sums+gradient_of_bands
-//@ variant project_disks_backward shape=disk+outline+pull_disk moments=moments_compact
+//@ variant project_disks_backward projection=projection+sight_eye
+//@ variant project_disks_backward shape=disk+outline+centre_straight+pull_disk
+//@ variant project_disks_backward moments=moments_compact
 //@ variant project_disks_backward gather=disk_rows+gather_slots+gradient_of_slots
-//@ variant project_disks_backward_f32 shape=disk+outline+pull_disk moments=moments_f32
+//@ variant project_disks_backward_f32 projection=projection+sight_eye
+//@ variant project_disks_backward_f32 shape=disk+outline+centre_straight+pull_disk
+//@ variant project_disks_backward_f32 moments=moments_f32
 //@ variant project_disks_backward_f32 gather=disk_rows+gather_slots+gradient_of_slots
-//@ variant project_disks_backward_bands shape=disk+outline+pull_disk moments=moments_compact
+//@ variant project_disks_backward_bands projection=projection+sight_eye
+//@ variant project_disks_backward_bands shape=disk+outline+centre_straight+pull_disk
+//@ variant project_disks_backward_bands moments=moments_compact
 //@ variant project_disks_backward_bands gather=disk_sums+gradient_of_bands
-//@ variant project_disks_backward_bands_f32 shape=disk+outline+pull_disk moments=moments_f32
+//@ variant project_disks_backward_bands_f32 projection=projection+sight_eye
+//@ variant project_disks_backward_bands_f32 shape=disk+outline+centre_straight+pull_disk
+//@ variant project_disks_backward_bands_f32 moments=moments_f32
 //@ variant project_disks_backward_bands_f32 gather=disk_sums+gradient_of_bands
+//@ variant project_refracted_backward projection=projection+surface+sight_refracted
+//@ variant project_refracted_backward shape=disk+outline+centre_refracted+pull_disk
+//@ variant project_refracted_backward moments=moments_compact gather=disk_rows+gather_slots+gradient_of_slots
+//@ variant project_refracted_backward_f32 projection=projection+surface+sight_refracted
+//@ variant project_refracted_backward_f32 shape=disk+outline+centre_refracted+pull_disk
+//@ variant project_refracted_backward_f32 moments=moments_f32 gather=disk_rows+gather_slots+gradient_of_slots
+//@ variant project_refracted_backward_bands projection=projection+surface+sight_refracted
+//@ variant project_refracted_backward_bands shape=disk+outline+centre_refracted+pull_disk
+//@ variant project_refracted_backward_bands moments=moments_compact gather=disk_sums+gradient_of_bands
+//@ variant project_refracted_backward_bands_f32 projection=projection+surface+sight_refracted
+//@ variant project_refracted_backward_bands_f32 shape=disk+outline+centre_refracted+pull_disk
+//@ variant project_refracted_backward_bands_f32 moments=moments_f32 gather=disk_sums+gradient_of_bands
 // From the gradients of the splats to updated Gaussians: backward projection and Adam in one step.
 //
 // Gradients of parameters are never stored. One thread per visible Gaussian of the block. It sums the
@@ -53,7 +81,8 @@ struct Step {
     // than clear_range.
     overwhite_weight: f32,
     floater_weight: f32,
-    pad: f32,
+    // Of the masks of disks.
+    mask_lr: f32,
     seed: u32,
     // 1 writes raw gradients instead of taking steps, if moments are f32 (tests): [v_mean, v_logit],
     // [v_quat], [v_log_scale].
@@ -105,14 +134,14 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     // Sums of density control, and smoothing; see the end.
     let seen = density_sums[i];
     let opacity = sigmoid(t0.w);
-    let pulled = pull(sum, mean, quat, rot, bare_scales, seen.z, opacity);
+    let pulled = pull(sum, mean, quat, rot, bare_scales, t2.xyz, seen.z, opacity);
     let v_quat = pulled.v_quat / quat_norm;
     var v_mean = pulled.v_mean;
     var v_logit = pulled.v_logit;
     var v_log_scale = pulled.v_log_scale;
 
     // Colour = max(0, 0.5 + sum of coefficient * basis(direction)).
-    let offset = mean - frame.eye;
+    let offset = mean - sight_of(mean);
     let distance = length(offset);
     let direction = offset / distance;
     let degree = veiled(frame.sh_degree, arrayLength(&sh_coeffs));
@@ -167,6 +196,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     // (core/twins/src/adam.rs).
     let rates = vec4<f32>(lr_scale, lr_scale, 1.0, lr_scale)
         * vec4<f32>(step.means_lr, step.quats_lr, step.scales_lr, step.opacity_lr);
+    let third_rates = vec4<f32>(rates.zz, select(step.mask_lr, rates.z, HAS_SCALE.z > 0.0), rates.z);
     let sh_rates = vec2<f32>(lr_scale, 1.0) * vec2<f32>(step.sh_dc_lr, step.sh_rest_lr);
     begin_colour(i, v_rgb, greatest_of(basis_values), pace);
     var weights = Basis(vec4<f32>(0.0), vec4<f32>(0.0), vec4<f32>(0.0), vec4<f32>(0.0));
@@ -200,7 +230,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     }
     end_colour(i);
     let v_direction = basis_gradient(degree, direction, weights);
-    v_mean += (v_direction - direction * dot(direction, v_direction)) / distance;
+    v_mean += sight_pulled(mean, (v_direction - direction * dot(direction, v_direction)) / distance);
 
     if gradients_only {
         keep_gradients(i, vec4<f32>(v_mean, v_logit), v_quat, vec4<f32>(v_log_scale, 0.0));
@@ -216,7 +246,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
 
     var new0 = t0 - transform_step(i, 0u, vec4<f32>(v_mean, v_logit), rates.xxxw, pace);
     let new1 = t1 - transform_step(i, 1u, v_quat, rates.yyyy, pace);
-    let new2 = t2.xyz - transform_step(i, 2u, vec4<f32>(v_log_scale, 0.0), rates.zzzz, pace).xyz;
+    let new2 = t2.xyz - transform_step(i, 2u, vec4<f32>(v_log_scale, 0.0), third_rates, pace).xyz;
     if lr_scale * step.mean_noise > 0.0 {
         // Noise of the shape of the Gaussian, for Gaussians that are nearly transparent (gate of 3DGS-MCMC,
         // eq. 8).
@@ -230,7 +260,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         // Standard deviations times a standard normal. The code of the paper multiplies by the covariance,
         // whose unit is an area: in a scene in metres it throws Gaussians of half a metre across hundreds of
         // metres.
-        let shaped = rot * (bare_scales * normal);
+        let shaped = rot * (bare_scales * HAS_SCALE * normal);
         let moved = new0.xyz + (gate * lr_scale * step.mean_noise) * shaped;
         new0 = vec4<f32>(moved, new0.w);
     }

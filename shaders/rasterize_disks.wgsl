@@ -1,10 +1,13 @@
-//@ import frame, disk, disk_at_pixels, votes, exchange_disks
-// Blends the disks of a tile, front to back, as rasterize_forward does splats.
+//@ import frame, disk, met, rays, votes, exchange_disks
+//@ variant rasterize_disks rays=disk_at_pixels
+//@ variant trace_disks rays=traced_at_pixels
+// Blends the disks of a tile, front to back, as rasterize_forward does splats. The rays of its pixels come
+// from the eye, or from a water surface (traced_at_pixels.wgsl).
 //
 //   image   [H*W]   vec4: rgb over the background, alpha = 1 - T
 //   range_image [H*W]  sum of alpha T range, scene units: to where the ray meets the disk, or to the centre
-//             where the low-pass decides
-//   normal_image [H*W] vec4: sum of alpha T normal, camera axes, towards the camera; 0
+//             where the low-pass decides; along the ray
+//   normal_image [H*W] vec4: sum of alpha T normal, camera axes, towards the camera; sum of alpha T mask
 //   tile_ends [tiles]  number of the tile's disks that any pixel needed: the backward pass stops there
 // Twin: core/twins/src/disks.rs
 
@@ -31,6 +34,7 @@ struct Sums {
     nx: vec4<f32>,
     ny: vec4<f32>,
     nz: vec4<f32>,
+    mask: vec4<f32>,
 }
 
 var<private> sums_a: Sums;
@@ -40,11 +44,11 @@ var<private> end: u32;
 
 fn empty(on: vec4<f32>) -> Sums {
     let zero = vec4<f32>(0.0);
-    return Sums(vec4<f32>(1.0), on, zero, zero, zero, zero, zero, zero, zero);
+    return Sums(vec4<f32>(1.0), on, zero, zero, zero, zero, zero, zero, zero, zero);
 }
 
 // Adds a disk to four pixels and returns its weights.
-fn add(sums: ptr<private, Sums>, disk: Splat, met: Met, normal: vec3<f32>, lengths: vec4<f32>) -> vec4<f32> {
+fn add(sums: ptr<private, Sums>, disk: Splat, met: Met, normal: vec3<f32>) -> vec4<f32> {
     let raw = min(vec4<f32>(MAX_ALPHA), disk.d.y * exp(-0.5 * met.spread));
     let alpha = select(vec4<f32>(0.0), raw, raw >= vec4<f32>(MIN_ALPHA));
     let next = (*sums).T * (1.0 - alpha);
@@ -53,10 +57,11 @@ fn add(sums: ptr<private, Sums>, disk: Splat, met: Met, normal: vec3<f32>, lengt
     (*sums).r += w * disk.e.x;
     (*sums).g += w * disk.e.y;
     (*sums).b += w * disk.e.z;
-    (*sums).range += w * select(vec4<f32>(disk.d.z), met.t * lengths, met.is_hit);
+    (*sums).range += w * select(vec4<f32>(disk.d.z), met.t * met.lengths, met.is_hit);
     (*sums).nx += w * normal.x;
     (*sums).ny += w * normal.y;
     (*sums).nz += w * normal.z;
+    (*sums).mask += w * disk.e.w;
     (*sums).T -= w;
     return w;
 }
@@ -64,26 +69,26 @@ fn add(sums: ptr<private, Sums>, disk: Splat, met: Met, normal: vec3<f32>, lengt
 fn blend(disk: Splat, number: u32) {
     let plane = plane_of(disk);
     let normal = disk.c.w * plane.normal;
-    let w_a = add(&sums_a, disk, meet(disk, plane, ray_y_a, pixel_y_a), normal, ray_length_a);
-    let w_b = add(&sums_b, disk, meet(disk, plane, ray_y_b, pixel_y_b), normal, ray_length_b);
+    let w_a = add(&sums_a, disk, meet(disk, plane, rays_a), normal);
+    let w_b = add(&sums_b, disk, meet(disk, plane, rays_b), normal);
     let w = w_a + w_b;
     end = select(end, number + 1u, max(max(w.x, w.y), max(w.z, w.w)) > 0.0);
 }
 
-fn store_pixel(column: u32, row: u32, rgb: vec3<f32>, range: f32, normal: vec3<f32>, T: f32) {
+fn store_pixel(column: u32, row: u32, rgb: vec3<f32>, range: f32, normal: vec4<f32>, T: f32) {
     if row < frame.size.y {
         let at = row * frame.size.x + column;
         image[at] = vec4<f32>(rgb + T * frame.background, 1.0 - T);
         range_image[at] = range;
-        normal_image[at] = vec4<f32>(normal, 0.0);
+        normal_image[at] = normal;
     }
 }
 
 fn store_four(column: u32, row: u32, s: Sums) {
-    store_pixel(column, row, vec3<f32>(s.r.x, s.g.x, s.b.x), s.range.x, vec3<f32>(s.nx.x, s.ny.x, s.nz.x), s.T.x);
-    store_pixel(column, row + 1u, vec3<f32>(s.r.y, s.g.y, s.b.y), s.range.y, vec3<f32>(s.nx.y, s.ny.y, s.nz.y), s.T.y);
-    store_pixel(column, row + 2u, vec3<f32>(s.r.z, s.g.z, s.b.z), s.range.z, vec3<f32>(s.nx.z, s.ny.z, s.nz.z), s.T.z);
-    store_pixel(column, row + 3u, vec3<f32>(s.r.w, s.g.w, s.b.w), s.range.w, vec3<f32>(s.nx.w, s.ny.w, s.nz.w), s.T.w);
+    store_pixel(column, row, vec3<f32>(s.r.x, s.g.x, s.b.x), s.range.x, vec4<f32>(s.nx.x, s.ny.x, s.nz.x, s.mask.x), s.T.x);
+    store_pixel(column, row + 1u, vec3<f32>(s.r.y, s.g.y, s.b.y), s.range.y, vec4<f32>(s.nx.y, s.ny.y, s.nz.y, s.mask.y), s.T.y);
+    store_pixel(column, row + 2u, vec3<f32>(s.r.z, s.g.z, s.b.z), s.range.z, vec4<f32>(s.nx.z, s.ny.z, s.nz.z, s.mask.z), s.T.z);
+    store_pixel(column, row + 3u, vec3<f32>(s.r.w, s.g.w, s.b.w), s.range.w, vec4<f32>(s.nx.w, s.ny.w, s.nz.w, s.mask.w), s.T.w);
 }
 
 @compute @workgroup_size(LANES)
@@ -98,14 +103,14 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let row = corner.y + (lane / TILE) * 8u;
     begin_rays(column, row);
     end = 0u;
-    // Pixels outside the image end immediately.
-    let inside = column < frame.size.x;
-    let height = vec4<f32>(f32(frame.size.y));
-    sums_a = empty(select(vec4<f32>(0.0), vec4<f32>(1.0), (pixel_y_a < height) & vec4<bool>(inside)));
-    sums_b = empty(select(vec4<f32>(0.0), vec4<f32>(1.0), (pixel_y_b < height) & vec4<bool>(inside)));
+    // Pixels outside the image and pixels without a ray end immediately.
+    sums_a = empty(rays_a.on);
+    sums_b = empty(rays_b.on);
+    let begun = rays_a.on + rays_b.on;
+    let has_rays = any_thread(lane, begun.x + begun.y + begun.z + begun.w > 0.0);
 
     let range = ranges[tile];
-    for (var first = range.x; first < range.y; first += BATCH) {
+    for (var first = select(range.y, range.x, has_rays); first < range.y; first += BATCH) {
         share_splats(lane, first, range.y);
         let number = first - range.x;
         blend(shared_splat(0u), number + 0u);
@@ -129,7 +134,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     if lane == 0u {
         tile_ends[tile] = furthest;
     }
-    if inside {
+    if column < frame.size.x {
         store_four(column, row, sums_a);
         store_four(column, row + 4u, sums_b);
     }

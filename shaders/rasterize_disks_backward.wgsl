@@ -1,7 +1,9 @@
-//@ import frame, disk, disk_at_pixels, votes, exchange_disks, sums_disks
+//@ import frame, disk, met, rays, notes, votes, exchange_disks, sums_disks
+//@ variant rasterize_disks_backward rays=disk_at_pixels notes=mask_gradients
+//@ variant trace_disks_backward rays=traced_at_pixels notes=ray_gradients
 // Gradients of the blending of disks, for every intersection; see rasterize_backward.
 //
-//   v_pixels [H*W*2] vec4 of gather_pixel_gradients
+//   v_pixels vec4: of gather_pixel_gradients [H*W*2], or of surface_compose_backward [H*W] for traced rays
 //   slot_gradients [intersections*5] vec4: the gradient of disk.wgsl, at the slot where the intersection was
 //            emitted
 // In the coordinates of the disk all gradients are sums of a few products, for any ray: with v_p the gradient
@@ -18,8 +20,8 @@
 @group(0) @binding(7) var<storage, read> v_pixels: array<vec4<f32>>;
 @group(0) @binding(8) var<storage, read_write> slot_gradients: array<vec4<f32>>;
 
-// Four pixels: transmittance, whether the ray goes on, the gradients of rgb, normal and range, and the
-// remainder.
+// Four pixels: transmittance, whether the ray goes on, the gradients of rgb, normal and range, the remainder,
+// and the gradient of the mask.
 struct Four {
     T: vec4<f32>,
     on: vec4<f32>,
@@ -31,34 +33,38 @@ struct Four {
     nz: vec4<f32>,
     range: vec4<f32>,
     rem: vec4<f32>,
+    mask: vec4<f32>,
 }
 
 var<private> four_a: Four;
 var<private> four_b: Four;
 
+var<private> noted_a: Noted;
+var<private> noted_b: Noted;
+
 struct Pixel {
-    on: f32,
     v: vec4<f32>,
     surface: vec4<f32>,
+    mask: f32,
 }
 
 // Zeros outside the image.
 fn load_pixel(column: u32, row: u32) -> Pixel {
     if column >= frame.size.x || row >= frame.size.y {
-        return Pixel(0.0, vec4<f32>(0.0), vec4<f32>(0.0));
+        return Pixel(vec4<f32>(0.0), vec4<f32>(0.0), 0.0);
     }
-    let at = 2u * (row * frame.size.x + column);
-    return Pixel(1.0, v_pixels[at], v_pixels[at + 1u]);
+    let at = row * frame.size.x + column;
+    return Pixel(v_of(at), v_surface_of(at), v_mask_of(at));
 }
 
-fn load_four(column: u32, row: u32) -> Four {
+fn load_four(column: u32, row: u32, on: vec4<f32>) -> Four {
     let p = load_pixel(column, row);
     let q = load_pixel(column, row + 1u);
     let r = load_pixel(column, row + 2u);
     let s = load_pixel(column, row + 3u);
     return Four(
         vec4<f32>(1.0),
-        vec4<f32>(p.on, q.on, r.on, s.on),
+        on,
         vec4<f32>(p.v.x, q.v.x, r.v.x, s.v.x),
         vec4<f32>(p.v.y, q.v.y, r.v.y, s.v.y),
         vec4<f32>(p.v.z, q.v.z, r.v.z, s.v.z),
@@ -67,6 +73,7 @@ fn load_four(column: u32, row: u32) -> Four {
         vec4<f32>(p.surface.z, q.surface.z, r.surface.z, s.surface.z),
         vec4<f32>(p.surface.w, q.surface.w, r.surface.w, s.surface.w),
         vec4<f32>(p.v.w, q.v.w, r.v.w, s.v.w),
+        vec4<f32>(p.mask, q.mask, r.mask, s.mask),
     );
 }
 
@@ -75,10 +82,10 @@ fn sum4(v: vec4<f32>) -> f32 {
 }
 
 // The gradient of a disk at four pixels, summed; behind it, the remainder and the transmittance.
-fn unblend_four(four: ptr<private, Four>, disk: Splat, plane: Plane, normal: vec3<f32>, ray_y: vec4<f32>,
-        pixel_y: vec4<f32>, lengths: vec4<f32>) -> Splat {
+fn unblend_four(four: ptr<private, Four>, noted: ptr<private, Noted>, disk: Splat, plane: Plane,
+        normal: vec3<f32>, rays: Rays) -> Splat {
     let zero = vec4<f32>(0.0);
-    let met = meet(disk, plane, ray_y, pixel_y);
+    let met = meet(disk, plane, rays);
     let fall = exp(-0.5 * met.spread);
     let raw = disk.d.y * fall;
     let capped = min(vec4<f32>(MAX_ALPHA), raw);
@@ -86,9 +93,9 @@ fn unblend_four(four: ptr<private, Four>, disk: Splat, plane: Plane, normal: vec
     let left = 1.0 - alpha;
     (*four).on = select(zero, (*four).on, (*four).T * left >= vec4<f32>(MIN_TRANSMITTANCE));
     let w = (*four).on * alpha * (*four).T;
-    let range = select(vec4<f32>(disk.d.z), met.t * lengths, met.is_hit);
+    let range = select(vec4<f32>(disk.d.z), met.t * met.lengths, met.is_hit);
     let worth = disk.e.x * (*four).r + disk.e.y * (*four).g + disk.e.z * (*four).b + range * (*four).range
-        + normal.x * (*four).nx + normal.y * (*four).ny + normal.z * (*four).nz;
+        + normal.x * (*four).nx + normal.y * (*four).ny + normal.z * (*four).nz + disk.e.w * (*four).mask;
     (*four).rem -= w * worth;
     // Zero if the disk was not blended, or if MAX_ALPHA capped its alpha.
     let v_alpha = select(zero, (*four).T * worth - (*four).rem / left, (w > zero) & (raw <= vec4<f32>(MAX_ALPHA)));
@@ -99,11 +106,12 @@ fn unblend_four(four: ptr<private, Four>, disk: Splat, plane: Plane, normal: vec
     // Where the ray meets the disk; u and v are 0 elsewhere.
     let v_u = v_sigma * met.u;
     let v_v = v_sigma * met.v;
-    let v_p_along = v_u * (plane.along.y + disk.b.y * ray_y) + v_v * (plane.along.z + disk.c.y * ray_y);
+    let v_p_along = v_u * met.along_u + v_v * met.along_v;
     let turn = select(zero, v_p_along / met.steep, met.is_hit);
-    let tau = turn + select(zero, v_range * lengths / met.steep, met.is_hit);
-    let on_image_x = met.t / frame.focal.x * (v_u * disk.b.x + v_v * disk.c.x - plane.normal.x * turn);
-    let on_image_y = met.t / frame.focal.y * (v_u * disk.b.y + v_v * disk.c.y - plane.normal.y * turn);
+    let tau = turn + select(zero, v_range * met.lengths / met.steep, met.is_hit);
+    note(noted, disk, plane, met, v_u, v_v, turn);
+    let on_image_x = met.far / frame.focal.x * (v_u * disk.b.x + v_v * disk.c.x - plane.normal.x * turn);
+    let on_image_y = met.far / frame.focal.y * (v_u * disk.b.y + v_v * disk.c.y - plane.normal.y * turn);
 
     // Where the low-pass decides.
     let v_thin = select(2.0 * v_sigma, zero, met.is_hit);
@@ -122,15 +130,15 @@ fn unblend_four(four: ptr<private, Four>, disk: Splat, plane: Plane, normal: vec
             sum4(select(v_range, zero, met.is_hit)),
             sum4(abs(on_image_x + v_x) + abs(on_image_y + v_y)),
         ),
-        vec4<f32>(sum4(w * (*four).r), sum4(w * (*four).g), sum4(w * (*four).b), sum4(w)),
+        vec4<f32>(sum4(w * (*four).r), sum4(w * (*four).g), sum4(w * (*four).b), sum4(w * (*four).mask)),
     );
 }
 
 fn unblend(disk: Splat) -> Splat {
     let plane = plane_of(disk);
     let normal = disk.c.w * plane.normal;
-    let p = unblend_four(&four_a, disk, plane, normal, ray_y_a, pixel_y_a, ray_length_a);
-    let q = unblend_four(&four_b, disk, plane, normal, ray_y_b, pixel_y_b, ray_length_b);
+    let p = unblend_four(&four_a, &noted_a, disk, plane, normal, rays_a);
+    let q = unblend_four(&four_b, &noted_b, disk, plane, normal, rays_b);
     return Splat(p.a + q.a, p.b + q.b, p.c + q.c, p.d + q.d, p.e + q.e);
 }
 
@@ -145,8 +153,8 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let column = corner.x + lane % TILE;
     let row = corner.y + (lane / TILE) * 8u;
     begin_rays(column, row);
-    four_a = load_four(column, row);
-    four_b = load_four(column, row + 4u);
+    four_a = load_four(column, row, rays_a.on);
+    four_b = load_four(column, row + 4u, rays_b.on);
 
     let range = ranges[tile];
     let last = min(range.x + tile_ends[tile], range.y);
@@ -163,6 +171,8 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         give_sums(lane, 7u, unblend(shared_splat(7u)));
         write_sums(lane, first, 1u, last);
     }
+    store_noted(column, row, noted_a);
+    store_noted(column, row + 4u, noted_b);
     for (var i = last + lane; i < range.y; i += LANES) {
         let at = 5u * slots[i];
         slot_gradients[at] = vec4<f32>(0.0);

@@ -42,11 +42,12 @@ pub struct JobArgs {
     /// Pixels of a mask to keep: white or black [default: white]
     #[arg(long, value_name = "SIDE", value_parser = ["white", "black"])]
     pub mask_keep: Option<String>,
-    /// Method that trains the scene: splats (3D Gaussians) or 2dgs (disks on surfaces) [default: splats]
+    /// Method that trains the scene: splats (3D Gaussians), 2dgs (disks on surfaces) or wsgs (through a water
+    /// surface) [default: splats]
     #[arg(long, value_name = "NAME")]
     pub method: Option<String>,
-    /// Preset that all other settings start from: fathom, paper (SMP-UWGS as printed), 3dgs (no water) or
-    /// 2dgs (disks, no water) [default: fathom]
+    /// Preset that all other settings start from: fathom, paper (SMP-UWGS as printed), 3dgs (no water),
+    /// 2dgs (disks, no water) or wsgs (seen through a water surface) [default: fathom]
     #[arg(long, value_name = "NAME")]
     pub preset: Option<String>,
     /// Seed of all random numbers [default: 1]

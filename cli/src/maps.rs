@@ -7,7 +7,7 @@
 use std::path::{Path, PathBuf};
 
 use clap::ValueEnum;
-use fathom_core::gpu::Rendered;
+use fathom_core::gpu::{Rendered, SurfaceOutput};
 use fathom_core::picture;
 use serde_json::{Value, json};
 
@@ -24,6 +24,14 @@ pub enum Map {
     /// Shortest axes of the Gaussians, facing the camera: PNG, (n + 1) / 2 as RGB, in the camera's frame (x
     /// right, y down, z forward), 128 grey where there is nothing
     Normal,
+    /// Method wsgs: what the water surface reflects, at full strength: PNG
+    Reflected,
+    /// Method wsgs: what lies in the water, as the surface refracts it: PNG
+    Refracted,
+    /// Method wsgs: the share of the light that the surface reflects, 0 to 1: PNG, 8 bits
+    Fresnel,
+    /// Method wsgs: where the scene above water is seen, 0 to 1: PNG, 8 bits
+    Mask,
 }
 
 /// Share of the nearest and of the farthest pixels that the scale of the range PNGs excludes.
@@ -34,11 +42,27 @@ const SAMPLES_PER_PICTURE: usize = 1024;
 const NPY_HEADER: usize = 128;
 
 impl Map {
-    fn folder(self) -> &'static str {
+    /// Name of its folder.
+    pub fn folder(self) -> &'static str {
         match self {
             Self::Range => "range",
             Self::Alpha => "alpha",
             Self::Normal => "normal",
+            Self::Reflected => "reflected",
+            Self::Refracted => "refracted",
+            Self::Fresnel => "fresnel",
+            Self::Mask => "mask",
+        }
+    }
+
+    /// What it shows of a scene with a water surface; `None` for maps of every model.
+    pub fn of_surface(self) -> Option<SurfaceOutput> {
+        match self {
+            Self::Range | Self::Alpha | Self::Normal => None,
+            Self::Reflected => Some(SurfaceOutput::Reflected),
+            Self::Refracted => Some(SurfaceOutput::Refracted),
+            Self::Fresnel => Some(SurfaceOutput::Reflectance),
+            Self::Mask => Some(SurfaceOutput::Mask),
         }
     }
 }
@@ -105,6 +129,28 @@ impl MapWriter {
             let rgb: Vec<u8> =
                 normals.iter().flatten().map(|component| code((component + 1.0) / 2.0)).collect();
             self.put(Map::Normal, Path::new(picture), &picture::encode_png(width, height, &rgb)?)?;
+        }
+        Ok(())
+    }
+
+    /// Writes the maps that only a scene with a water surface has. `render` gives each of them.
+    pub fn write_of_surface(
+        &mut self,
+        picture: &str,
+        mut render: impl FnMut(SurfaceOutput) -> Result<Rendered>,
+    ) -> Result<()> {
+        for map in self.maps.clone() {
+            let Some(output) = map.of_surface() else { continue };
+            let shown = render(output)?;
+            let bytes: Vec<u8> = shown.rgb.iter().flatten().map(|value| code(*value)).collect();
+            let png = match output {
+                SurfaceOutput::Reflectance | SurfaceOutput::Mask => {
+                    let grey: Vec<u8> = bytes.iter().step_by(3).copied().collect();
+                    picture::encode_grey_png(shown.width, shown.height, &grey)?
+                }
+                _ => picture::encode_png(shown.width, shown.height, &bytes)?,
+            };
+            self.put(map, Path::new(picture), &png)?;
         }
         Ok(())
     }

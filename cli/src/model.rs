@@ -1,12 +1,14 @@
 //! A trained model on disk: a result folder of `fathom train`, or a PLY alone.
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use fathom_core::axes;
 use fathom_core::config::DataConfig;
 use fathom_core::gaussians::Gaussians;
-use fathom_core::gpu::{AdapterSummary, Gpu, GpuOptions, adapters};
+use fathom_core::gpu::{AdapterSummary, Gpu, GpuOptions, SurfaceRenderer, adapters};
 use fathom_core::ply;
+use fathom_core::surface::SurfaceModel;
 use glam::DQuat;
 
 use crate::error::{CliError, Result};
@@ -75,6 +77,19 @@ pub fn model_path(given: &Path) -> Result<PathBuf> {
         )));
     }
     Ok(given.to_owned())
+}
+
+/// Renders a result through its water surface, from the folder `sets` beside its model; `None` if it has
+/// none.
+///
+/// # Errors
+/// When the sets cannot be read, or the device cannot hold them.
+pub fn surface_renderer(gpu: &Arc<Gpu>, model: &Path) -> Result<Option<SurfaceRenderer>> {
+    let sets = model.with_file_name("sets");
+    if !sets.is_dir() {
+        return Ok(None);
+    }
+    Ok(Some(SurfaceRenderer::new(Arc::clone(gpu), &SurfaceModel::read_sets(&sets)?)?))
 }
 
 /// Prefix of the PLY comment of a model exported with a white point; its JSON follows.

@@ -171,6 +171,7 @@ impl Step {
             v_range: &self.v_range,
             slot_gradients: &self.slot_gradients,
             disks: None,
+            traced: None,
             step: &self.rates,
             appearances: &[],
         };

@@ -78,6 +78,7 @@ fn iteration(gpu: &Arc<Gpu>, n: u32, width: u32, height: u32) -> Fallible<[Vec<f
         v_range: &gpu.buffer("v_range", pixels as u64 * 4)?,
         slot_gradients: &gpu.buffer("slot gradients", u64::from(frame.capacities().1) * 48)?,
         disks: None,
+        traced: None,
         step: &gpu.uniform("step", &step),
         appearances: &[],
     };

@@ -46,6 +46,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         context: Gaussians::empty(3),
         surfaces: Gaussians::empty(3),
         medium: None,
+        surface: None,
     };
     let limits = ListLimits::of(&gpu);
     println!("{}: lists of at most {} rows", gpu.adapter().name, limits.visible.min(limits.intersections));

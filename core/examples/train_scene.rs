@@ -273,6 +273,7 @@ fn main() -> Fallible<()> {
         context: Gaussians::empty(config.sh_degree),
         surfaces: surface_points(&points, train.views(), &scene_views, &config, medium.as_ref(), |_| true)?,
         medium,
+        surface: None,
         extent: learning_scale(scene.extent(), scene.viewing_distance()) as f32,
         views: train,
         config: config.clone(),

@@ -34,9 +34,15 @@ pub const BAND_BYTES: u64 = 48;
 pub const DISK_BYTES: u64 = 48;
 /// Bytes per intersection of a disk for its gradient: five vec4.
 pub const DISK_GRADIENT_BYTES: u64 = 80;
-/// Bytes per pixel of disks, beside those of Gaussians: blended normal; in training its gradient, and what
-/// the backward pass needs of the pixel (vec4, and three of them).
-pub const DISK_PIXEL_BYTES: [u64; 2] = [16, 48];
+/// Bytes per pixel of disks, beside those of Gaussians. The first is the blended normal (vec4). The second is
+/// for training: its gradient, two vec4 for the backward pass, and the gradient of the mask.
+pub const DISK_PIXEL_BYTES: [u64; 2] = [16, 52];
+/// Bytes per pixel of the reflected and the refracted set of a scene with a water surface: render, blended
+/// normal and rays (two vec4) of each.
+pub const SET_PIXEL_BYTES: u64 = 2 * (RENDER_BYTES + 16 + 32);
+/// Bytes per pixel of the surface: the picture (vec4), gradients of the two pictures (vec4) and of their rays
+/// (two vec4), and that of the reflectance.
+pub const SURFACE_PIXEL_BYTES: u64 = 16 + 2 * 16 + 2 * 32 + 4;
 
 /// Bytes of the gradient of an intersection, and of the sums of bands of a Gaussian.
 pub fn slot_bytes(disks: bool) -> u64 {
@@ -155,7 +161,8 @@ pub fn trained_bytes(sh_degree: u8, moments: Moments) -> u64 {
 /// Bytes per pixel of a training picture during training.
 pub fn pixel_bytes(settings: Settings<'_>) -> u64 {
     let of_disks: u64 = if settings.train.disks { DISK_PIXEL_BYTES.iter().sum() } else { 0 };
-    RENDER_BYTES + LOSS_BYTES + appearance::pixel_bytes(settings) + of_disks
+    let of_sets = if settings.train.sets.is_some() { SET_PIXEL_BYTES + SURFACE_PIXEL_BYTES } else { 0 };
+    RENDER_BYTES + LOSS_BYTES + appearance::pixel_bytes(settings) + of_disks + of_sets
 }
 
 /// Lengths of the lists of a view.
@@ -245,6 +252,32 @@ impl RunSize<'_> {
         trained_bytes(config.sh_degree, config.moments) + bands
     }
 
+    /// The sizes of the three sets of a scene with a water surface: straight, refracted, reflected.
+    fn sets(&self, shares: [f32; 3]) -> [Self; 3] {
+        let sum: f64 = shares.iter().map(|&share| f64::from(share)).sum();
+        shares.map(|share| {
+            let of = |all: u64| (all as f64 * f64::from(share) / sum.max(1e-9)) as u64;
+            Self { trained: of(self.trained).max(1), visible: of(self.visible), frozen: 0, ..self.clone() }
+        })
+    }
+
+    /// Bytes of the lists of a view: by visible Gaussian, and by intersection.
+    fn list_bytes(&self) -> [u64; 2] {
+        if let Some(shares) = self.settings.train.sets {
+            let each = self.sets(shares).map(|set| set.own_list_bytes());
+            return [0, 1].map(|kind| each.iter().map(|bytes| bytes[kind]).sum());
+        }
+        self.own_list_bytes()
+    }
+
+    fn own_list_bytes(&self) -> [u64; 2] {
+        let (lists, disks) = (self.lists(), self.settings.train.disks);
+        [
+            u64::from(lists.visible) * visible_bytes(disks),
+            u64::from(lists.intersections) * intersection_bytes(disks),
+        ]
+    }
+
     /// Peak memory of the run on the device, except half a MiB for wgpu and less than 1 % for tiles,
     /// histograms and uniforms.
     ///
@@ -264,17 +297,19 @@ impl RunSize<'_> {
         let read_back = self.trained.min(block_capacity(config.moments).into())
             * of_colour.max(transform_moment_bytes(config.moments));
         let uploaded = (photograph * views.min(BATCH.into())).min(STAGED_BYTES.max(photograph));
+        let [per_visible, per_intersection] = self.list_bytes();
         let disks = config.disks;
         let of_disks = if disks { DISK_PIXEL_BYTES[0] } else { 0 };
         let copy = self.trained * (frozen_bytes + FLAG_BYTES)
             + visible * visible_bytes(disks)
             + intersections * (INTERSECTION_BYTES - GRADIENT_BYTES)
             + pixels * (RENDER_BYTES + of_disks)
+            + if config.sets.is_some() { pixels * (SET_PIXEL_BYTES + SURFACE_PIXEL_BYTES) } else { 0 }
             + (self.trained * frozen_bytes).min(STAGED_BYTES);
         MemoryForecast {
             gaussians: self.trained * self.trained_bytes() + self.frozen * frozen_bytes + all * FLAG_BYTES,
-            per_visible: visible * visible_bytes(disks),
-            per_intersection: intersections * intersection_bytes(disks),
+            per_visible,
+            per_intersection,
             pixels: pixels * pixel_bytes(self.settings),
             photographs: self.photographs(),
             transfers: read_back.max(uploaded),

@@ -10,6 +10,8 @@ use crate::Result;
 use crate::gaussians::Gaussians;
 use crate::gpu::Gpu;
 use crate::scene::{PinholeCamera, Pose};
+use crate::surface::SurfaceModel;
+use crate::train::surface::SurfaceTrainer;
 use crate::train::{HeldOutMetrics, Preview, Progress, TrainRun, Trainer};
 use crate::views::ViewSource;
 use crate::water::{StandardErrors, Water, WaterRecord};
@@ -20,6 +22,8 @@ pub use crate::config::Method;
 pub struct Trained {
     /// The model.
     pub gaussians: Gaussians,
+    /// The whole scene if it has a water surface; `gaussians` is then the scene without it.
+    pub surface: Option<SurfaceModel>,
     /// Its water, if the run has one.
     pub water: Option<WaterRecord>,
     /// Optimiser steps of the water that were skipped because a gradient was not finite.
@@ -100,6 +104,7 @@ pub fn start(method: Method, gpu: Arc<Gpu>, run: TrainRun) -> Result<Box<dyn Run
     match method {
         // The configuration of the run says which of the two it is.
         Method::Splats | Method::Disks => Ok(Box::new(Trainer::new(gpu, run)?)),
+        Method::Surface => Ok(Box::new(SurfaceTrainer::new(gpu, run)?)),
     }
 }
 
@@ -151,8 +156,65 @@ impl Run for Trainer {
     fn hand_in(&mut self, metres_per_unit: f64) -> Result<Trained> {
         Ok(Trained {
             gaussians: self.gaussians()?,
+            surface: None,
             water: self.water_record(metres_per_unit)?,
             skipped_steps: self.water_steps_left_out()?,
+        })
+    }
+}
+
+impl Run for SurfaceTrainer {
+    fn advance(&mut self, iterations: u32) -> Result<Progress> {
+        self.advance(iterations)
+    }
+
+    fn progress(&self) -> Progress {
+        self.progress()
+    }
+
+    fn checkpoint(&mut self) -> Result<Vec<u8>> {
+        self.checkpoint()
+    }
+
+    fn go_to(&mut self, checkpoint: &[u8]) -> Result<()> {
+        self.go_to(checkpoint)
+    }
+
+    fn measure(
+        &mut self,
+        held_out: &dyn ViewSource,
+        go_on: &dyn Fn() -> bool,
+    ) -> Result<Option<HeldOutMetrics>> {
+        self.measure(held_out, go_on)
+    }
+
+    fn preview(
+        &mut self,
+        cameras: &[(PinholeCamera, Pose)],
+        go_on: &dyn Fn() -> bool,
+    ) -> Result<Vec<Preview>> {
+        self.preview(cameras, go_on)
+    }
+
+    fn water(&self) -> Result<Option<Water>> {
+        Ok(None)
+    }
+
+    fn water_errors(&self) -> Option<StandardErrors> {
+        None
+    }
+
+    fn waited_for_photographs(&self) -> Duration {
+        self.waited_for_photographs()
+    }
+
+    fn hand_in(&mut self, _metres_per_unit: f64) -> Result<Trained> {
+        let model = self.model()?;
+        Ok(Trained {
+            gaussians: model.dry(),
+            surface: Some(model),
+            water: None,
+            skipped_steps: self.steps_left_out()?,
         })
     }
 }

@@ -28,6 +28,8 @@ pub enum Stream {
     ViewSample = 10,
     /// Directions of disks at the start.
     Turn = 11,
+    /// Disks of the reflected set at the start.
+    Sets = 12,
 }
 
 /// 32 random bits for (seed, stream, a, b): PCG3D of Jarzynski and Olano (JCGT 2020), two rounds.

@@ -59,6 +59,7 @@ impl ViewerColours {
             context: Gaussians::empty(model.sh_degree),
             surfaces: Gaussians::empty(model.sh_degree),
             medium: None,
+            surface: None,
         };
         let mut trainer = Trainer::new(Arc::clone(gpu), run)?;
         loop {

@@ -26,6 +26,7 @@ fn run(cap: u32) -> TrainRun {
         context: Gaussians::empty(3),
         surfaces: Gaussians::empty(3),
         medium: None,
+        surface: None,
     }
 }
 

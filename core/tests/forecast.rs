@@ -84,6 +84,7 @@ impl Case {
             context: self.model(6, self.frozen),
             surfaces: Gaussians::empty(self.config().sh_degree),
             medium: self.water.then(|| MediumRun::fixed(&self.water_config(), Composition::PixelsSrgb, 1.0)),
+            surface: None,
         }
     }
 
@@ -208,6 +209,7 @@ fn the_forecast_sizes_match_the_buffers() {
             "filmed",
             "normal image",
             "gradient of normals",
+            "gradient of masks",
             "pixel gradients",
         ];
         let [trained, frozen] = [case.trained, case.frozen].map(u64::from);

@@ -40,6 +40,7 @@ fn memory_does_not_grow_with_the_iterations_of_a_run() {
         context: Gaussians::empty(3),
         surfaces: Gaussians::empty(3),
         medium: None,
+        surface: None,
     };
     let mut trainer = Trainer::new(gpu, run).unwrap();
     trainer.advance(100).unwrap();

@@ -5,7 +5,8 @@ const VISIBLE: u32 = 1u;
 const INTERSECTIONS: u32 = 2u;
 const DEPTH_HISTOGRAM: u32 = 3u;
 const TILE_HISTOGRAM: u32 = 4u;
-// Sticky: bit 0 visible, bit 1 intersections. While set, every iteration does nothing.
+// Sticky: bit 0 visible, bit 1 intersections, bit 2 another frame of the same view (agree.wgsl). While set,
+// every iteration does nothing.
 const OVERFLOW: u32 = 5u;
 const FAILED_AT: u32 = 6u;
 const NEEDED_VISIBLE: u32 = 7u;

@@ -1,29 +1,37 @@
-// A disk at the eight pixels of a thread (Huang et al. 2024). Needs frame, disk.
+// Disks at the eight pixels of a thread (Huang et al. 2024), for rays from the eye. Needs frame, disk, met.
 //
 //     t = N.m / N.d,  p = t d - m,  u = a_u.p,  v = a_v.p,  N = a_u x a_v,  d the ray of the pixel with z = 1
 //     sigma = min(u^2 + v^2, 2 |centre - pixel|^2) / 2
 // A ray that meets the plane nearer than NEAR, or not at all, sees only the second term: the low-pass.
 
-// The rays of the thread's pixels: x of one column, y and lengths of rows 0 to 3 in _a, of 4 to 7 in _b.
+// The rays of four rows of a column.
+struct Rays {
+    // 1 inside the image, else 0.
+    on: vec4<f32>,
+    pixel_y: vec4<f32>,
+    y: vec4<f32>,
+    lengths: vec4<f32>,
+}
+
 var<private> pixel_x: f32;
-var<private> pixel_y_a: vec4<f32>;
-var<private> pixel_y_b: vec4<f32>;
 var<private> ray_x: f32;
-var<private> ray_y_a: vec4<f32>;
-var<private> ray_y_b: vec4<f32>;
-var<private> ray_length_a: vec4<f32>;
-var<private> ray_length_b: vec4<f32>;
+// Rows 0 to 3 and 4 to 7 of the thread.
+var<private> rays_a: Rays;
+var<private> rays_b: Rays;
+
+fn rays_of(column: u32, pixel_y: vec4<f32>) -> Rays {
+    let y = (pixel_y - frame.principal.y) / frame.focal.y;
+    let inside = (pixel_y < vec4<f32>(f32(frame.size.y))) & vec4<bool>(column < frame.size.x);
+    let on = select(vec4<f32>(0.0), vec4<f32>(1.0), inside);
+    return Rays(on, pixel_y, y, sqrt(1.0 + ray_x * ray_x + y * y));
+}
 
 fn begin_rays(column: u32, row: u32) {
     pixel_x = f32(column) + 0.5;
-    pixel_y_a = vec4<f32>(f32(row)) + vec4<f32>(0.5, 1.5, 2.5, 3.5);
-    pixel_y_b = pixel_y_a + 4.0;
     ray_x = (pixel_x - frame.principal.x) / frame.focal.x;
-    ray_y_a = (pixel_y_a - frame.principal.y) / frame.focal.y;
-    ray_y_b = (pixel_y_b - frame.principal.y) / frame.focal.y;
-    let flat = 1.0 + ray_x * ray_x;
-    ray_length_a = sqrt(flat + ray_y_a * ray_y_a);
-    ray_length_b = sqrt(flat + ray_y_b * ray_y_b);
+    let pixel_y = vec4<f32>(f32(row)) + vec4<f32>(0.5, 1.5, 2.5, 3.5);
+    rays_a = rays_of(column, pixel_y);
+    rays_b = rays_of(column, pixel_y + 4.0);
 }
 
 // What is the same at all pixels of a column.
@@ -46,35 +54,13 @@ fn plane_of(disk: Splat) -> Plane {
     );
 }
 
-// A disk at four pixels.
-struct Met {
-    // Zeros where the low-pass decides.
-    u: vec4<f32>,
-    v: vec4<f32>,
-    t: vec4<f32>,
-    // N.d, never 0.
-    steep: vec4<f32>,
-    // Twice sigma.
-    spread: vec4<f32>,
-    is_hit: vec4<bool>,
-    // From the pixel to the projected centre.
-    dx: f32,
-    dy: vec4<f32>,
-}
-
-fn meet(disk: Splat, plane: Plane, ray_y: vec4<f32>, pixel_y: vec4<f32>) -> Met {
-    let slope = plane.along.x + plane.normal.y * ray_y;
+fn meet(disk: Splat, plane: Plane, rays: Rays) -> Met {
+    let slope = plane.along.x + plane.normal.y * rays.y;
     let steep = select(slope, vec4<f32>(1e-30), abs(slope) < vec4<f32>(1e-30));
     let t = plane.at_centre.x / steep;
-    let u = t * (plane.along.y + disk.b.y * ray_y) - plane.at_centre.y;
-    let v = t * (plane.along.z + disk.c.y * ray_y) - plane.at_centre.z;
-    let solid = u * u + v * v;
-    let dx = disk.a.w - pixel_x;
-    let dy = disk.b.w - pixel_y;
-    let thin = 2.0 * (dx * dx + dy * dy);
-    // False for numbers that are not finite.
-    let is_hit = (t > vec4<f32>(NEAR)) & (solid <= thin);
-    let zero = vec4<f32>(0.0);
-    return Met(select(zero, u, is_hit), select(zero, v, is_hit), select(zero, t, is_hit), steep,
-        select(thin, solid, is_hit), is_hit, dx, dy);
+    let along_u = plane.along.y + disk.b.y * rays.y;
+    let along_v = plane.along.z + disk.c.y * rays.y;
+    let u = t * along_u - plane.at_centre.y;
+    let v = t * along_v - plane.at_centre.z;
+    return met_of(disk, u, v, t, t > vec4<f32>(NEAR), steep, along_u, along_v, t, rays.lengths, rays.pixel_y);
 }

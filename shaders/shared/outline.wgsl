@@ -18,6 +18,15 @@ const LEAST_IN_FRONT: f32 = 0.01;
 // Standard deviation of the low-pass of disks, pixels.
 const LOW_PASS: f32 = 0.70710678;
 
+// Share of its distance that the scale of a disk may have for all of it to be bent nearly as its centre is.
+const SMALL: f32 = 0.03;
+
+// Factor on the ellipse of the centre that holds the outline of such a disk of `size` times its distance,
+// which is that along the bent ray. Outlines of 3,500 random disks reached at most 0.97 of it.
+fn wider(size: f32) -> f32 {
+    return 1.0 + 6.0 * size;
+}
+
 // A direction in camera axes.
 fn turned(frame: Frame, axis: vec3<f32>) -> vec3<f32> {
     return vec3<f32>(dot(frame.view_x.xyz, axis), dot(frame.view_y.xyz, axis), dot(frame.view_z.xyz, axis));
@@ -28,15 +37,20 @@ fn depth_left(m: vec3<f32>, h_u: vec3<f32>, h_v: vec3<f32>, squared: f32) -> f32
     return m.z * m.z - squared * (h_u.z * h_u.z + h_v.z * h_v.z);
 }
 
+// `reach` standard deviations of it hold the image.
+fn whole_image(frame: Frame, centre2d: vec2<f32>, reach: f32) -> Bound {
+    let half = 0.5 * vec2<f32>(frame.size);
+    let wide = (length(half) + 1.0) / reach;
+    return Bound(half - centre2d, vec3<f32>(wide * wide, 0.0, wide * wide));
+}
+
 // Holds the disk of radius sqrt(squared) standard deviations, and the circle of the low-pass. `centre2d` is
 // its projected centre. A disk that reaches behind the camera may be anywhere: its bound is the whole image.
 fn bound_of(frame: Frame, m: vec3<f32>, centre2d: vec2<f32>, h_u: vec3<f32>, h_v: vec3<f32>, squared: f32) -> Bound {
     let left = depth_left(m, h_u, h_v, squared);
     let reach = max(sqrt(squared), 1e-3);
     if !(left > LEAST_IN_FRONT * m.z * m.z) {
-        let half = 0.5 * vec2<f32>(frame.size);
-        let wide = (length(half) + 1.0) / reach;
-        return Bound(half - centre2d, vec3<f32>(wide * wide, 0.0, wide * wide));
+        return whole_image(frame, centre2d, reach);
     }
     let inv_z = 1.0 / m.z;
     let p = frame.focal * (h_u.xy - (h_u.z * inv_z) * m.xy);

@@ -1,5 +1,5 @@
 // From the gradient of a disk to that of its 2D Gaussian (disk.wgsl), without the colour. Needs frame,
-// gaussian, projection, outline and disk. Twin: core/twins/src/disks.rs
+// gaussian, projection, outline, disk and centre_*.wgsl. Twin: core/twins/src/disks.rs
 
 struct Pulled {
     v_mean: vec3<f32>,
@@ -9,12 +9,12 @@ struct Pulled {
     v_logit: f32,
 }
 
-// Disks have no third scale.
+// Disks have no third scale. Its place holds the logit of the mask.
 const HAS_SCALE: vec3<f32> = vec3<f32>(1.0, 1.0, 0.0);
 
 // Whether no pixel that counts sees the disk.
 fn is_untouched(sum: Splat) -> bool {
-    return all(sum.e.xyz == vec3<f32>(0.0)) && all(sum.d == vec4<f32>(0.0)) && sum.a.z == 0.0;
+    return all(sum.e == vec4<f32>(0.0)) && all(sum.d == vec4<f32>(0.0)) && sum.a.z == 0.0;
 }
 
 fn colour_gradient(sum: Splat) -> vec3<f32> {
@@ -35,8 +35,8 @@ fn in_world(axis: vec3<f32>) -> vec3<f32> {
     return axis.x * frame.view_x.xyz + axis.y * frame.view_y.xyz + axis.z * frame.view_z.xyz;
 }
 
-fn pull(sum: Splat, mean: vec3<f32>, quat: vec4<f32>, rot: mat3x3<f32>, scales: vec3<f32>, smoothing: f32,
-        opacity: f32) -> Pulled {
+fn pull(sum: Splat, mean: vec3<f32>, quat: vec4<f32>, rot: mat3x3<f32>, scales: vec3<f32>, log_scale: vec3<f32>,
+        smoothing: f32, opacity: f32) -> Pulled {
     let u = turned(frame, rot[0]);
     let v = turned(frame, rot[1]);
     let m = to_camera(frame, mean);
@@ -50,7 +50,8 @@ fn pull(sum: Splat, mean: vec3<f32>, quat: vec4<f32>, rot: mat3x3<f32>, scales: 
     let v_normal = -(sum.c.x * h_u + sum.c.y * h_v);
     let v_au = sum.b.x * h_u + sum.b.y * h_v + cross(a_v, v_normal);
     let v_av = sum.b.z * h_u + sum.b.w * h_v + cross(v_normal, a_u);
-    let v_log_scale = vec3<f32>(-dot(v_au, a_u), -dot(v_av, a_v), 0.0);
+    let mask = sigmoid(log_scale.z);
+    let v_log_scale = vec3<f32>(-dot(v_au, a_u), -dot(v_av, a_v), sum.e.w * mask * (1.0 - mask));
 
     // The blended normal is the third axis, turned towards the camera.
     let side = select(1.0, -1.0, dot(normal, m) > 0.0);
@@ -66,12 +67,9 @@ fn pull(sum: Splat, mean: vec3<f32>, quat: vec4<f32>, rot: mat3x3<f32>, scales: 
         x * (r0.z + r2.x) + y * (r1.z + r2.y) - 2.0 * z * (r0.x + r1.y) + w * (r0.y - r1.x),
     );
 
-    // p = t d - m; centre2d = f x/z + principal point; range = |m|.
+    // p = o + t d - m.
     var v_centre = sum.a.z * normal - sum.a.x * a_u - sum.a.y * a_v;
-    let inv_z = 1.0 / m.z;
-    let v_centre2d = frame.focal * sum.c.zw;
-    v_centre += inv_z * vec3<f32>(v_centre2d, -dot(v_centre2d, m.xy) * inv_z);
-    v_centre += (sum.d.z / length(m)) * m;
+    v_centre += centre_pulled(m, sum.c.zw, sum.d.z);
     return Pulled(in_world(v_centre), v_unit - quat * dot(v_unit, quat), v_log_scale,
         sum.a.w * opacity * (1.0 - opacity));
 }

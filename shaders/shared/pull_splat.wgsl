@@ -30,8 +30,8 @@ fn gradient_on_image(sum: Splat) -> f32 {
     return sum.b.w;
 }
 
-fn pull(sum: Splat, mean: vec3<f32>, quat: vec4<f32>, rot: mat3x3<f32>, bare_scales: vec3<f32>, smoothing: f32,
-        opacity: f32) -> Pulled {
+fn pull(sum: Splat, mean: vec3<f32>, quat: vec4<f32>, rot: mat3x3<f32>, bare_scales: vec3<f32>, log_scale: vec3<f32>,
+        smoothing: f32, opacity: f32) -> Pulled {
     let g0 = sum.a;
     let g1 = sum.b;
     var scales = bare_scales;

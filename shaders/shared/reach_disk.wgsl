@@ -16,6 +16,11 @@ fn reach_of(frame: Frame, m: vec3<f32>, max_scale: f32, deviations: f32) -> vec2
     return along + vec2<f32>(deviations * LOW_PASS + 0.5);
 }
 
+fn place_of(frame: Frame, mean: vec3<f32>, m: vec3<f32>, max_scale: f32, deviations: f32) -> Place {
+    return Place(frame.focal * m.xy / m.z + frame.principal, reach_of(frame, m, max_scale, deviations),
+        m.z > NEAR && is_on_side(mean));
+}
+
 // Disks have no third scale.
 fn largest_of(log_scale: vec3<f32>) -> f32 {
     return max(log_scale.x, log_scale.y);

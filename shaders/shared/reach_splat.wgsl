@@ -8,6 +8,10 @@ fn reach_of(frame: Frame, m: vec3<f32>, max_scale: f32, deviations: f32) -> vec2
     return deviations * (frame.focal * spread + vec2<f32>(sqrt(BLUR))) + vec2<f32>(0.5);
 }
 
+fn place_of(frame: Frame, mean: vec3<f32>, m: vec3<f32>, max_scale: f32, deviations: f32) -> Place {
+    return Place(frame.focal * m.xy / m.z + frame.principal, reach_of(frame, m, max_scale, deviations), m.z > NEAR);
+}
+
 fn largest_of(log_scale: vec3<f32>) -> f32 {
     return max(log_scale.x, max(log_scale.y, log_scale.z));
 }

@@ -8,8 +8,11 @@
 struct Shape {
     mean2d: vec2<f32>,
     conic: vec3<f32>,
-    centre: vec3<f32>,
+    range: f32,
+    depth: f32,
     opacity: f32,
+    // 1 for a disk that is part of the scene above water (gaussian.wgsl).
+    mask: f32,
     is_sound: bool,
 }
 
@@ -34,5 +37,5 @@ fn shape_of(i: u32, visible_id: u32, mean: vec3<f32>, opacity: f32, quat: vec4<f
     let is_sound = det > 0.0 && is_finite(det) && is_finite(conic.x) && is_finite(conic.y) && is_finite(conic.z)
         && is_finite(mean2d.x) && is_finite(mean2d.y) && is_finite(1.0 / area)
         && is_finite(dot(a_u, a_u)) && is_finite(dot(a_v, a_v));
-    return Shape(mean2d, conic, m, opacity, is_sound);
+    return Shape(mean2d, conic, length(m), m.z, opacity, sigmoid(log_scale.z), is_sound);
 }

@@ -7,10 +7,13 @@ struct Shape {
     // Pixels, 1/pixel^2.
     mean2d: vec2<f32>,
     conic: vec3<f32>,
-    // Of the centre, camera space, scene units.
-    centre: vec3<f32>,
+    // Of the centre, scene units: distance from the camera, and depth.
+    range: f32,
+    depth: f32,
     // With the effect of the filters of Mip-Splatting.
     opacity: f32,
+    // Kept behind the colour; 0 for 3D Gaussians.
+    mask: f32,
     // False for a covariance that overflowed, or cancelled to nothing: it touches no tile.
     is_sound: bool,
 }
@@ -37,5 +40,5 @@ fn shape_of(i: u32, visible_id: u32, mean: vec3<f32>, solid_opacity: f32, quat: 
     }
     let is_sound = det > 0.0 && is_finite(det) && is_finite(conic.x) && is_finite(conic.y) && is_finite(conic.z)
         && is_finite(mean2d.x) && is_finite(mean2d.y);
-    return Shape(mean2d, conic, p.centre, opacity, is_sound);
+    return Shape(mean2d, conic, length(p.centre), p.centre.z, opacity, 0.0, is_sound);
 }

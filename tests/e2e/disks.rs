@@ -56,7 +56,7 @@ fn disks_are_refused_where_they_cannot_be_trained() {
     let (_, said) = refused("water.medium=per_gaussian");
     assert!(said.contains("blends disks before the water acts"), "{said}");
     let (_, said) = refused("train.mip_filter=true");
-    assert!(said.contains("low-pass of its own"), "{said}");
+    assert!(said.contains("low-pass of their own"), "{said}");
     let (_, said) = fail(&["train", &scene, "-o", &out, "--allow-cpu", "--method", "4dgs"]);
     assert!(said.contains(r#"no method "4dgs""#) && said.contains("2dgs"), "{said}");
     assert!(!folder.path().join("out").exists(), "a refused job left a folder");

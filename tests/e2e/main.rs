@@ -40,3 +40,4 @@ mod store_faults;
 mod train;
 mod two_coordinators;
 mod view;
+mod water_surface;

@@ -32,8 +32,8 @@ code, and a test fails when it is out of date.
 4. the flags of common settings, which `fathom train --help` lists
 
 Unknown keys are refused. `deploy/job.example.toml` holds every key with its default. Each result stores its
-settings in `OUT/run.json`. Values of the presets `paper`, `3dgs` and `2dgs` are listed where they differ from
-the default. [Papers](../papers.md) has the sources in full.
+settings in `OUT/run.json`. Values of the presets `paper`, `3dgs`, `2dgs` and `wsgs` are listed where they
+differ from the default. [Papers](../papers.md) has the sources in full.
 
 A share is a number from 0 to 1. A share of the run counts in iterations of the run. Learning rates are
 those of Adam, per iteration.
@@ -91,6 +91,7 @@ fn job_sections() -> Vec<Section> {
         ("paper", json(&JobConfig::of_preset(Preset::Paper))),
         ("3dgs", json(&JobConfig::of_preset(Preset::Splatting))),
         ("2dgs", json(&JobConfig::of_preset(Preset::Disks))),
+        ("wsgs", json(&JobConfig::of_preset(Preset::Surface))),
     ];
     let mut sections = Vec::new();
     add_section(&source, "JobConfig", "", &presets, &mut sections);
@@ -159,7 +160,10 @@ fn page() -> String {
         }
         page += "| key | default | unit | meaning | source and notes |\n|---|---|---|---|---|\n";
         for setting in &section.settings {
-            let mut default = format!("`{}`", toml(&setting.default));
+            let mut default = match &setting.default {
+                Value::Null => "not set".to_owned(),
+                default => format!("`{}`", toml(default)),
+            };
             for (preset, value) in &setting.others {
                 write!(default, "; `{preset}`: `{}`", toml(value)).unwrap();
             }
@@ -260,14 +264,12 @@ fn job_example() -> String {
             if !words.is_empty() && !words.iter().all(|word| comment.contains(word.trim_matches('"'))) {
                 write!(comment, ": {}", words.join(", ")).unwrap();
             }
-            writeln!(
-                file,
-                "{}\n{} = {}",
-                wrapped(&format!("{comment}."), "# "),
-                setting.key,
-                toml(&setting.default)
-            )
-            .unwrap();
+            writeln!(file, "{}", wrapped(&format!("{comment}."), "# ")).unwrap();
+            match &setting.default {
+                // TOML has no null.
+                Value::Null => writeln!(file, "# {} is not set.", setting.key).unwrap(),
+                default => writeln!(file, "{} = {}", setting.key, toml(default)).unwrap(),
+            }
         }
     }
     file

@@ -173,6 +173,7 @@ fn measure(args: &EvalArgs) -> Result<Value> {
     let drawing = fathom_core::ply::drawing(&path)?;
     let mut renderer =
         Renderer::new(Arc::clone(&gpu), &gaussians)?.drawn(drawing)?.with_water(through(Output::Underwater));
+    let mut surface = model::surface_renderer(&gpu, &path)?;
     let mut seams = match seams::plan_of(&args.model, args.plan.as_deref())? {
         Some(plan) => seams::run_of(
             &gpu,
@@ -193,7 +194,10 @@ fn measure(args: &EvalArgs) -> Result<Value> {
     let mut open_water = OpenWater::default();
     for (index, view) in held_out {
         let (camera, photograph) = load_photograph(&scene, view, &config)?;
-        let rendered = renderer.render(&camera, &view.pose, [0.0; 3])?;
+        let rendered = match &mut surface {
+            Some(surface) => surface.render(&camera, &view.pose)?,
+            None => renderer.render(&camera, &view.pose, [0.0; 3])?,
+        };
         let render = metrics::quantised(rendered.width, rendered.height, &rendered.rgb);
         let map = SsimMap::new(&render, &photograph);
         let border = match &mut seams {
@@ -203,6 +207,11 @@ fn measure(args: &EvalArgs) -> Result<Value> {
         let (psnr, ssim) = (metrics::psnr(&render, &photograph), map.as_ref().map(SsimMap::mean));
         let mut of_view = json!({ "name": view.name, "psnr": psnr, "ssim": ssim });
         let clear = match through(Output::Restored) {
+            // The scene without its water surface.
+            None if surface.is_some() => {
+                let clear = renderer.render(&camera, &view.pose, [0.0; 3])?;
+                metrics::quantised(clear.width, clear.height, &clear.rgb)
+            }
             // Without a medium, the render itself is compared with J.
             None => render.clone(),
             output => {

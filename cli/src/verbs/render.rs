@@ -2,11 +2,12 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use clap::{ArgGroup, Args, ValueEnum};
 use fathom_core::config::DataConfig;
 use fathom_core::gaussians::Gaussians;
-use fathom_core::gpu::{Output, Rendered, Renderer, WaterView};
+use fathom_core::gpu::{Gpu, Output, Rendered, Renderer, SurfaceRenderer, WaterView};
 use fathom_core::picture;
 use fathom_core::scene::{CameraPath, Orbit, PinholeCamera, Pose, Purpose, load_scene};
 use fathom_core::white_point::apply;
@@ -65,9 +66,15 @@ pub struct RenderArgs {
     /// backscatter alone
     #[arg(long, value_name = "on|off|only", value_enum, default_value = "off")]
     water: WaterShown,
+    /// Results of method wsgs: the scene without the water surface
+    #[arg(long, conflicts_with = "ior")]
+    no_surface: bool,
+    /// Results of method wsgs: another liquid in place of the water, by its refractive index (oil: 1.46)
+    #[arg(long, value_name = "N", value_parser = parse_positive)]
+    ior: Option<f64>,
     #[command(flatten)]
     white_point: WhitePointArgs,
-    /// Maps to write beside the colours, into DIR/range, DIR/alpha, DIR/normal
+    /// Maps to write beside the colours, one folder each: DIR/range, DIR/alpha, ...
     #[arg(long, value_name = "MAP,...", value_enum, value_delimiter = ',')]
     maps: Vec<Map>,
     /// Size of the pictures, independent of the cameras: each picture holds the whole undistorted view of its
@@ -165,7 +172,9 @@ fn render(args: RenderArgs) -> Result<()> {
     if args.cameras.is_none() || args.path.is_some() {
         refuse_later_frames(&args.output, &shots)?;
     }
-    let mut renderer = Renderer::new(args.gpu.open()?, &model)?
+    let gpu = args.gpu.open()?;
+    let mut surface = args.surface(&gpu, &path)?;
+    let mut renderer = Renderer::new(gpu, &model)?
         .drawn(fathom_core::ply::drawing(&path)?)?
         .with_water(args.water_view(&path)?);
     let named: Vec<_> = shots.iter().map(|shot| (shot.name.as_str(), &shot.camera, &shot.pose)).collect();
@@ -178,7 +187,10 @@ fn render(args: RenderArgs) -> Result<()> {
     let progress = Progress::new("rendering", shots.len() as u64, Unit::Count("pictures"));
     let mut files = Vec::new();
     for (index, shot) in shots.iter().enumerate() {
-        let mut rendered = renderer.render(&shot.camera, &shot.pose, [0.0; 3])?;
+        let mut rendered = match &mut surface {
+            Some(surface) => surface.render(&shot.camera, &shot.pose)?,
+            None => renderer.render(&shot.camera, &shot.pose, [0.0; 3])?,
+        };
         if let Some(white) = &white {
             apply(&mut rendered.rgb, white.gains);
         }
@@ -191,6 +203,11 @@ fn render(args: RenderArgs) -> Result<()> {
             None
         };
         maps.write(&shot.name, &rendered, normals.as_deref())?;
+        if let Some(surface) = &mut surface {
+            maps.write_of_surface(&shot.name, |output| {
+                Ok(surface.render_as(&shot.camera, &shot.pose, output)?)
+            })?;
+        }
         files.push(path);
         progress.set(index as u64 + 1, "");
     }
@@ -220,6 +237,31 @@ fn render(args: RenderArgs) -> Result<()> {
 }
 
 impl RenderArgs {
+    /// How to render through the water surface of a result; `None` for other models, and without it.
+    fn surface(&self, gpu: &Arc<Gpu>, path: &Path) -> Result<Option<SurfaceRenderer>> {
+        let Some(mut renderer) = model::surface_renderer(gpu, path)? else {
+            let of_surface = self.maps.iter().find(|map| map.of_surface().is_some());
+            let wants = match (self.ior, of_surface) {
+                _ if self.no_surface => "--no-surface".to_owned(),
+                (Some(_), _) => "--ior".to_owned(),
+                (None, Some(map)) => format!("--maps {}", map.folder()),
+                (None, None) => return Ok(None),
+            };
+            return Err(CliError::Message(format!(
+                "{wants} is for results with a water surface, but there is no folder `sets` beside {}; give the \
+                 result folder of a job of method wsgs",
+                path.display()
+            )));
+        };
+        if self.no_surface {
+            return Ok(None);
+        }
+        if let Some(ior) = self.ior {
+            renderer.set_ior(ior).map_err(|error| CliError::Message(format!("--ior: {error}")))?;
+        }
+        Ok(Some(renderer))
+    }
+
     /// Rendering of the model's water; `None` if it has none.
     fn water_view(&self, path: &Path) -> Result<Option<WaterView>> {
         let record = fathom_core::ply::water_record(path)?;

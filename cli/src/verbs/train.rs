@@ -195,11 +195,13 @@ struct RunRequest {
 }
 
 /// Files of a result. They are never replaced, so none may exist when a run starts.
-const RESULTS: [&str; 10] = [
+const RESULTS: [&str; 12] = [
     "model.ply",
     "model.compressed.ply",
     "model.json",
     "water.json",
+    "surface.json",
+    "sets",
     "metrics.json",
     "run.json",
     "plan.json",

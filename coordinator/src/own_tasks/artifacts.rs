@@ -19,9 +19,9 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
 use super::evaluation::{self, Evaluated};
-use super::input::{JobInput, blocking, made, read_plan};
+use super::input::{JobInput, blocking, config_of, made, read_plan};
 use super::merge::MergeReport;
-use super::{OwnTaskError, exchange, viewing_copy};
+use super::{OwnTaskError, exchange, sets, viewing_copy};
 use crate::objects::{BlobStore, ObjectError};
 use crate::schedule::{Artifact, HeldOut, JobRecord, Stage, TaskId, TaskOutput, TaskState, TaskStats};
 use crate::store::JobView;
@@ -75,13 +75,21 @@ pub async fn assemble(objects: &Arc<BlobStore>, view: &JobView) -> Result<TaskOu
     let views = input.views()?;
     let water = water_json(&report, exchange::read(objects, view).await?.as_ref());
 
-    let mut files = vec![
-        ("model.ply".to_owned(), model.clone()),
-        ("plan.json".to_owned(), plan_json),
-        ("plan.png".to_owned(), plan_png),
-    ];
-    files.push(("model.json".to_owned(), manifest_of(objects, &report.manifest, &model).await?));
-    if let Some(copy) = viewing_copy::make(objects, &model).await? {
+    // What viewers show.
+    let mut shown = model.clone();
+    let mut files = vec![("plan.json".to_owned(), plan_json), ("plan.png".to_owned(), plan_png)];
+    if config_of(job)?.method.through_surface() {
+        // Its rows are not those of the merge, which the manifest describes.
+        let sets = sets::make(objects, &model).await?;
+        if let Some((_, dry)) = sets.iter().find(|(name, _)| name == "model.ply") {
+            shown = dry.clone();
+        }
+        files.extend(sets);
+    } else {
+        files.push(("model.ply".to_owned(), model.clone()));
+        files.push(("model.json".to_owned(), manifest_of(objects, &report.manifest, &model).await?));
+    }
+    if let Some(copy) = viewing_copy::make(objects, &shown).await? {
         files.push((viewing_copy::FILE.to_owned(), copy));
     }
     for (path, value) in [

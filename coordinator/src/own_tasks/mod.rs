@@ -11,6 +11,7 @@ pub mod exchange;
 pub mod input;
 mod merge;
 pub mod plan;
+mod sets;
 mod viewing_copy;
 
 use std::sync::Arc;

@@ -12,17 +12,21 @@ pub enum Method {
     /// 2D Gaussians: disks on surfaces (2DGS, Huang et al. 2024).
     #[serde(rename = "2dgs")]
     Disks,
+    /// Disks in air and below a calm water surface that reflects and refracts (WSGS).
+    #[serde(rename = "wsgs")]
+    Surface,
 }
 
 impl Method {
     /// Every method of this program.
-    pub const ALL: [Self; 2] = [Self::Splats, Self::Disks];
+    pub const ALL: [Self; 3] = [Self::Splats, Self::Disks, Self::Surface];
 
     /// Its name in configurations.
     pub fn name(self) -> &'static str {
         match self {
             Self::Splats => "splats",
             Self::Disks => "2dgs",
+            Self::Surface => "wsgs",
         }
     }
 
@@ -31,6 +35,7 @@ impl Method {
     pub fn through_surface(self) -> bool {
         match self {
             Self::Splats | Self::Disks => false,
+            Self::Surface => true,
         }
     }
 }

@@ -16,6 +16,7 @@ mod numbers;
 mod partitions;
 mod priors;
 mod seams;
+mod surface;
 mod train;
 mod water;
 mod weights;
@@ -33,6 +34,7 @@ pub use network::{NetworkConfig, NetworkStart};
 pub use partitions::WaterPartitions;
 pub use priors::{DarkChannelOn, PriorsConfig};
 pub use seams::SeamsConfig;
+pub use surface::{Reflectance, SurfaceConfig, SurfaceLight, SurfaceRefine, SurfaceStart};
 pub use train::{ClassicConfig, Moments, Strategy, TrainConfig};
 pub use water::{Blend, LossLight, Medium, WaterConfig, WaterPrior};
 pub use weights::{WeightMode, WeightTerms};
@@ -56,6 +58,9 @@ pub enum Preset {
     /// 2D Gaussian splatting (disks) without a medium, in sRGB.
     #[serde(rename = "2dgs")]
     Disks,
+    /// A scene seen through a calm water surface: disks in air and below it (WSGS).
+    #[serde(rename = "wsgs")]
+    Surface,
 }
 
 /// Everything except the input that determines the result of a job.
@@ -64,8 +69,8 @@ pub enum Preset {
 pub struct JobConfig {
     /// Starting point of all other values.
     pub preset: Preset,
-    /// Method that trains the scene: `splats` (3D Gaussians) or `2dgs` (2D Gaussians: disks on surfaces).
-    /// Default `splats`.
+    /// Method that trains the scene: `splats` (3D Gaussians), `2dgs` (2D Gaussians: disks on surfaces) or
+    /// `wsgs` (disks seen through a water surface). Default `splats`.
     pub method: Method,
     /// Photographs: sizes, held-out views, masks.
     pub data: DataConfig,
@@ -75,6 +80,8 @@ pub struct JobConfig {
     pub train: TrainConfig,
     /// The medium between camera and scene.
     pub water: WaterConfig,
+    /// The water surface that cameras in air look through; for method `wsgs`.
+    pub surface: SurfaceConfig,
     /// Merging the partitions into one model.
     pub merge: MergeConfig,
     /// Border refinement after the merge.
@@ -102,15 +109,20 @@ impl JobConfig {
         let water = match preset {
             Preset::Fathom => WaterConfig::default(),
             Preset::Paper => WaterConfig::paper(),
-            Preset::Splatting | Preset::Disks => WaterConfig::none(),
+            Preset::Splatting | Preset::Disks | Preset::Surface => WaterConfig::none(),
         };
-        let method = if preset == Preset::Disks { Method::Disks } else { Method::default() };
+        let method = match preset {
+            Preset::Disks => Method::Disks,
+            Preset::Surface => Method::Surface,
+            _ => Method::default(),
+        };
         Self { preset, method, water, ..Self::default() }.with_shape()
     }
 
     /// Sets what the method says about its Gaussians.
     fn with_shape(mut self) -> Self {
-        self.train.disks = self.method == Method::Disks;
+        self.train.disks = self.method != Method::Splats;
+        self.train.sets = (self.method == Method::Surface).then_some(self.surface.shares);
         self
     }
 
@@ -294,8 +306,8 @@ impl JobConfig {
             "partition.columns * partition.rows must be at most 4096",
         );
         require(
-            self.method != Method::Disks || !t.mip_filter,
-            "method = \"2dgs\" has a low-pass of its own; train.mip_filter must be false",
+            !t.disks || !t.mip_filter,
+            "methods 2dgs and wsgs have a low-pass of their own; train.mip_filter must be false",
         );
         require(
             self.method != Method::Disks || self.water.medium != Medium::PerGaussian,
@@ -305,6 +317,21 @@ impl JobConfig {
             (0.0..=10.0).contains(&t.normal_consistency) && (0.0..=1.0).contains(&t.normal_consistency_from),
             "train.normal_consistency must be from 0 to 10, and normal_consistency_from a share of the run",
         );
+        if self.method == Method::Surface {
+            require(
+                p.columns == 1 && p.rows == 1 && !p.auto,
+                "method = \"wsgs\" trains one partition; partition.columns and rows must be 1, and auto false",
+            );
+            require(
+                self.water.medium == Medium::None,
+                "method = \"wsgs\" looks through the surface of clear water; water.medium must be \"none\"",
+            );
+            require(
+                t.strategy == Strategy::Mcmc,
+                "method = \"wsgs\" needs train.strategy = \"mcmc\": the caps of its sets are fixed",
+            );
+            self.surface.validate(&mut require);
+        }
         p.validate_cut(&mut require);
         require((0.0..=10.0).contains(&p.extend_base), "partition.extend_base must be between 0 and 10");
         require(

@@ -198,6 +198,10 @@ pub struct TrainConfig {
     /// Whether Gaussians are disks. Set by `method`, never by itself.
     #[serde(skip)]
     pub disks: bool,
+    /// Shares of the cap of the three sets of a scene with a water surface (`surface.shares`). Set by
+    /// `method`, never by itself.
+    #[serde(skip)]
+    pub sets: Option<[f32; 3]>,
 }
 
 impl Default for TrainConfig {
@@ -243,6 +247,7 @@ impl Default for TrainConfig {
             classic: ClassicConfig::default(),
             loss_factor: 1.0,
             disks: false,
+            sets: None,
         }
     }
 }

@@ -193,9 +193,24 @@ impl Blocks {
     /// # Errors
     /// When the device cannot hold them.
     pub fn push_frozen(&mut self, gpu: &Gpu, model: &Gaussians, order: &[u32]) -> Result<()> {
+        self.push_frozen_as(gpu, model, model, order)
+    }
+
+    /// The same for disks with masks: their third numbers are no scales, so the bounds are those of `flat`,
+    /// the same disks without masks.
+    ///
+    /// # Errors
+    /// When the device cannot hold them.
+    pub fn push_frozen_as(
+        &mut self,
+        gpu: &Gpu,
+        model: &Gaussians,
+        flat: &Gaussians,
+        order: &[u32],
+    ) -> Result<()> {
         for rows in order.chunks(BLOCK_CAPACITY as usize) {
             let mut block = self.allocate(gpu, rows.len() as u32, None)?;
-            let bounds = chunk_bounds(model, rows);
+            let bounds = chunk_bounds(flat, rows);
             let buffer = gpu.buffer("culling bounds", bounds.len() as u64 * 16)?;
             gpu.write(&buffer, 0, &bounds);
             block.bounds = Some(buffer);

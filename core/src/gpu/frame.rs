@@ -7,69 +7,17 @@
 //! would exceed the largest binding is rendered in bands of tiles, one after the other.
 
 use super::layout::{DEPTH_BITS, FrameUniform, WaterUniform, counter};
-use super::{Block, Blocks, Gpu, Recorder, Scan, Size, Sort};
-use crate::memory::{LONGEST_ROW_BYTES, most_rows};
+use super::{Block, Blocks, Gpu, ListLimits, Overflow, Recorder, Scan, Size, Sort};
 use crate::water::Water;
 use crate::{CoreError, Result};
 
-/// A list that was too short, and the length it needed.
+/// The rays of a frame of disks that do not come from the eye.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Overflow {
-    /// First iteration that failed; it and all later ones did nothing.
-    pub failed_at: u32,
-    /// Visible Gaussians that it needed; 0 if they fitted.
-    pub visible: u32,
-    /// Intersections that it needed; 0 if they fitted.
-    pub intersections: u32,
-}
-
-/// Maximum lengths of the lists of a view. A view that needs more is rendered in bands of tiles.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct ListLimits {
-    /// Visible Gaussians.
-    pub visible: u32,
-    /// Intersections.
-    pub intersections: u32,
-}
-
-impl ListLimits {
-    /// The limits of the device's bindings, for 3D Gaussians.
-    pub fn of(gpu: &Gpu) -> Self {
-        Self::of_rows(gpu, false)
-    }
-
-    /// The same, for 3D Gaussians or for disks.
-    pub fn of_rows(gpu: &Gpu, disks: bool) -> Self {
-        let rows = most_rows(gpu.largest_binding(), disks);
-        Self { visible: rows, intersections: rows }
-    }
-
-    /// Number of bands for a view that overflowed with `bands`: more by the ratio of needed to allowed
-    /// length, plus a fifth.
-    ///
-    /// # Errors
-    /// [`CoreError::BufferTooLarge`] when every band is already a single tile.
-    pub fn more_bands(&self, overflow: Overflow, bands: u32, tiles: u32) -> Result<u32> {
-        if bands >= tiles {
-            return Err(CoreError::BufferTooLarge {
-                buffer: "the list of one tile of a view",
-                needed_bytes: LONGEST_ROW_BYTES * u64::from(overflow.visible.max(overflow.intersections)),
-                limit_bytes: LONGEST_ROW_BYTES * u64::from(self.visible.min(self.intersections)),
-            });
-        }
-        let share = |need: u32, most: u32| f64::from(need) / f64::from(most.max(1));
-        let missing =
-            share(overflow.visible, self.visible).max(share(overflow.intersections, self.intersections));
-        let wanted = (f64::from(bands) * missing * 1.2).ceil().min(f64::from(tiles));
-        Ok((wanted as u32).clamp(bands + 1, tiles))
-    }
-}
-
-impl Overflow {
-    /// Whether lists of these lengths would have been enough.
-    pub fn fits(&self, limits: ListLimits) -> bool {
-        self.visible <= limits.visible && self.intersections <= limits.intersections
-    }
+pub enum SurfaceRays {
+    /// Reflected by a water surface: they see the disks above it.
+    Reflected,
+    /// Refracted by it: they see the disks below.
+    Refracted,
 }
 
 /// Buffers whose size depends on the image.
@@ -80,6 +28,8 @@ pub struct FrameTargets {
     pub range_image: wgpu::Buffer,
     /// `[H*W]` vec4 of a frame of disks: blended normal, camera axes, towards the camera.
     pub normal_image: Option<wgpu::Buffer>,
+    /// `[H*W*2]` vec4 of a frame of rays at a water surface (`surface_rays.wgsl`).
+    pub rays: Option<wgpu::Buffer>,
     /// `[tiles+1]` first and last of the sorted intersections.
     pub ranges: wgpu::Buffer,
     /// `[tiles]`.
@@ -104,6 +54,8 @@ pub struct Frame {
     pub projected: wgpu::Buffer,
     /// `[visible*3]` vec4 of a frame of disks: disks in the camera's frame ([`Frame::of_disks`]).
     pub disks: Option<wgpu::Buffer>,
+    /// `SurfaceUniform` of a frame of rays at a water surface, and which rays they are.
+    pub surface: Option<(SurfaceRays, wgpu::Buffer)>,
     /// `[visible]`.
     pub gaussian_from_visible: wgpu::Buffer,
     /// `[visible]` (first slot, count).
@@ -143,6 +95,7 @@ impl Frame {
             flags: words("visible flags", gaussians, 1)?,
             projected: words("projected", visible, 12)?,
             disks: None,
+            surface: None,
             gaussian_from_visible: words("gaussian_from_visible", visible, 1)?,
             segments: words("segments", visible, 2)?,
             visible_from_slot: words("visible_from_slot", intersections, 1)?,
@@ -169,6 +122,33 @@ impl Frame {
         self.limits = ListLimits::of_rows(gpu, true);
         self.targets = None;
         Ok(self)
+    }
+
+    /// The same for rays at a water surface, of a frame of disks.
+    ///
+    /// # Errors
+    /// When the device fails.
+    pub fn at_surface(mut self, gpu: &Gpu, rays: SurfaceRays, surface: &wgpu::Buffer) -> Result<Self> {
+        // The view is mirrored on the device.
+        self.uniform = gpu.parameters("frame", size_of::<FrameUniform>() as u64)?;
+        self.surface = Some((rays, surface.clone()));
+        self.targets = None;
+        Ok(self)
+    }
+
+    /// The rays of the frame, if they begin at a water surface.
+    pub fn rays(&self) -> Option<SurfaceRays> {
+        self.surface.as_ref().map(|(rays, _)| *rays)
+    }
+
+    /// The surface, for kernels that need it.
+    pub(crate) fn bound_surface(&self) -> Option<(&'static str, &wgpu::Buffer)> {
+        self.surface.as_ref().map(|(_, surface)| ("surface", surface))
+    }
+
+    /// The same, for kernels that only refraction concerns.
+    pub(crate) fn bound_refraction(&self) -> Option<(&'static str, &wgpu::Buffer)> {
+        self.bound_surface().filter(|_| self.rays() == Some(SurfaceRays::Refracted))
     }
 
     /// Capacities: visible Gaussians and intersections.
@@ -242,6 +222,7 @@ impl Frame {
         buffers.extend(&self.disks);
         if let Some(targets) = &self.targets {
             buffers.extend(&targets.normal_image);
+            buffers.extend(&targets.rays);
             buffers.extend([&targets.image, &targets.range_image, &targets.ranges, &targets.tile_ends]);
         }
         buffers
@@ -281,6 +262,10 @@ impl Frame {
             range_image: gpu.buffer("range image", pixels * 4)?,
             normal_image: match &self.disks {
                 Some(_) => Some(gpu.buffer("normal image", pixels * 16)?),
+                None => None,
+            },
+            rays: match &self.surface {
+                Some(_) => Some(gpu.buffer("rays at the surface", pixels * 32)?),
                 None => None,
             },
             ranges: gpu.buffer("tile ranges", (tiles + 1) * 8)?,
@@ -327,7 +312,12 @@ impl Frame {
         ];
         let of_disks = self.disks.iter().map(|disks| ("disks", disks));
         bound.extend(of_disks.chain(targets.normal_image.iter().map(|image| ("normal_image", image))));
-        let kernel = if self.disks.is_some() { "rasterize_disks" } else { "rasterize_forward" };
+        bound.extend(targets.rays.iter().map(|rays| ("rays", rays)));
+        let kernel = match (&self.disks, &self.surface) {
+            (None, _) => "rasterize_forward",
+            (Some(_), None) => "rasterize_disks",
+            (Some(_), Some(_)) => "trace_disks",
+        };
         recorder.dispatch(kernel, Size::Groups(view.end_tile - view.first_tile), &bound)
     }
 
@@ -358,8 +348,20 @@ impl Frame {
         gpu.write(&self.uniform, 0, &[uniform]);
         gpu.write(&self.counters, 0, &[total]);
         let (frame, counters) = (("frame", &self.uniform), ("counters", &self.counters));
+        let cull = match (&self.disks, self.rays()) {
+            (None, _) => "cull",
+            (Some(_), None) => "cull_disks",
+            (Some(_), Some(SurfaceRays::Reflected)) => "cull_reflected",
+            (Some(_), Some(SurfaceRays::Refracted)) => "cull_refracted",
+        };
+        if let Some((SurfaceRays::Reflected, surface)) = &self.surface {
+            let bound = [("surface", surface), ("view", &self.uniform)];
+            recorder.dispatch("mirror_view", Size::Groups(1), &bound)?;
+        }
         for block in blocks.iter() {
-            if let Some(bounds) = &block.bounds {
+            // Chunks are tested for rays from an eye, mirrored or not.
+            let bounds = block.bounds.as_ref().filter(|_| self.rays() != Some(SurfaceRays::Refracted));
+            if let Some(bounds) = bounds {
                 recorder.dispatch(
                     if self.disks.is_some() { "cull_disk_chunks" } else { "cull_chunks" },
                     Size::Items(block.chunks(), 64),
@@ -371,18 +373,16 @@ impl Frame {
                     ],
                 )?;
             }
-            recorder.dispatch(
-                if self.disks.is_some() { "cull_disks" } else { "cull" },
-                Size::Items(block.count, 64),
-                &[
-                    frame,
-                    ("block", &block.uniform),
-                    ("transforms", &block.transforms),
-                    ("chunk_seen", &block.chunk_seen),
-                    ("density_sums", self.density_sums(block)),
-                    ("flags", &self.flags),
-                ],
-            )?;
+            let mut bound = vec![
+                frame,
+                ("block", &block.uniform),
+                ("transforms", &block.transforms),
+                ("chunk_seen", &block.chunk_seen),
+                ("density_sums", self.density_sums(block)),
+                ("flags", &self.flags),
+            ];
+            bound.extend(self.bound_surface());
+            recorder.dispatch(cull, Size::Items(block.count, 64), &bound)?;
         }
         let chunks = Size::Groups(Scan::groups(total));
         self.flag_scan.record(recorder, &self.counters, &self.flags, chunks)?;
@@ -468,27 +468,28 @@ impl Frame {
 
     fn record_projection(&self, recorder: &mut Recorder<'_>, block: &Block) -> Result<()> {
         let (kernel, of_shape) = match &self.disks {
+            Some(disks) if self.rays() == Some(SurfaceRays::Refracted) => {
+                ("project_refracted", ("disks", disks))
+            }
             Some(disks) => ("project_disks", ("disks", disks)),
             None => ("project_forward", ("density_sums", self.density_sums(block))),
         };
-        recorder.dispatch(
-            kernel,
-            Size::Items(block.count, 64),
-            &[
-                ("frame", &self.uniform),
-                ("block", &block.uniform),
-                ("transforms", &block.transforms),
-                ("sh_coeffs", &block.sh_coeffs),
-                of_shape,
-                ("flags", &self.flags),
-                ("counters", &self.counters),
-                ("projected", &self.projected),
-                ("depth_keys", &self.depth_sort.keys[0]),
-                ("order", &self.depth_sort.values[0]),
-                ("gaussian_from_visible", &self.gaussian_from_visible),
-                ("water", &self.water),
-            ],
-        )
+        let mut bound = vec![
+            ("frame", &self.uniform),
+            ("block", &block.uniform),
+            ("transforms", &block.transforms),
+            ("sh_coeffs", &block.sh_coeffs),
+            of_shape,
+            ("flags", &self.flags),
+            ("counters", &self.counters),
+            ("projected", &self.projected),
+            ("depth_keys", &self.depth_sort.keys[0]),
+            ("order", &self.depth_sort.values[0]),
+            ("gaussian_from_visible", &self.gaussian_from_visible),
+            ("water", &self.water),
+        ];
+        bound.extend(self.bound_refraction());
+        recorder.dispatch(kernel, Size::Items(block.count, 64), &bound)
     }
 
     fn density_sums<'a>(&'a self, block: &'a Block) -> &'a wgpu::Buffer {
@@ -545,9 +546,12 @@ impl Frame {
     /// When the device cannot hold them in addition to the old ones, which then stay.
     pub fn replace_lists(&mut self, gpu: &Gpu, visible: u32, intersections: u32) -> Result<()> {
         let new = Self::new(gpu, self.gaussian_capacity, visible, intersections)?;
-        let new = if self.disks.is_some() { new.of_disks(gpu)? } else { new }.with_limits(self.limits);
+        let mut new = if self.disks.is_some() { new.of_disks(gpu)? } else { new };
+        if let Some((rays, surface)) = &self.surface {
+            new = new.at_surface(gpu, *rays, surface)?;
+        }
         let targets = self.targets.take();
-        *self = Self { targets, water: self.water.clone(), ..new };
+        *self = Self { targets, water: self.water.clone(), limits: self.limits, ..new };
         Ok(())
     }
 

@@ -187,7 +187,7 @@ pub struct StepUniform {
     pub mean_noise: f32,
     pub overwhite_weight: f32,
     pub floater_weight: f32,
-    pub pad: f32,
+    pub mask_lr: f32,
     pub seed: u32,
     pub gradients_only: u32,
     pub trainable: u32,
@@ -434,6 +434,59 @@ pub struct NormalsUniform {
     pub least_alpha: f32,
     pub pad_a: f32,
     pub pad_b: f32,
+}
+
+/// `Surface` of `shared/surface.wgsl`.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
+#[expect(missing_docs, reason = "explained in the shader")]
+pub struct SurfaceUniform {
+    pub normal: [f32; 3],
+    pub offset: f32,
+    pub eta: f32,
+    pub schlick: u32,
+    pub as_shown: u32,
+    pub margin: f32,
+}
+
+/// `SurfaceStep` of `surface_step.wgsl`.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
+#[expect(missing_docs, reason = "explained in the shader")]
+pub struct SurfaceStepUniform {
+    pub rows: u32,
+    pub offset_rate: f32,
+    pub tilt_rate: f32,
+    pub unbias1: f32,
+    pub unbias2: f32,
+    pub pad: u32,
+    pub pad1: u32,
+    pub pad2: u32,
+    pub pivot: [f32; 3],
+    pub pad3: f32,
+}
+
+/// `SurfaceState` of `surface_step.wgsl`.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
+#[expect(missing_docs, reason = "explained in the shader")]
+pub struct SurfaceState {
+    pub moment1: [f32; 4],
+    pub moment2: [f32; 4],
+    pub left_out: f32,
+    pub pad0: f32,
+    pub pad1: f32,
+    pub pad2: f32,
+}
+
+/// `MaskLoss` of `surface_mask.wgsl`.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
+#[expect(missing_docs, reason = "explained in the shader")]
+pub struct MaskLossUniform {
+    pub cells: [u32; 2],
+    pub first: u32,
+    pub weight: f32,
 }
 
 /// Rows of partial sums of `water_gradients` for this many Gaussians in this many blocks. The last block

@@ -9,6 +9,7 @@ mod compressed;
 pub(crate) mod header;
 mod read;
 mod rows;
+mod surface;
 mod write;
 
 use std::fmt::Write as _;
@@ -23,6 +24,7 @@ pub const ANTIALIASED: &str = "antialiased: opacity makes up for a low-pass of 0
 pub const DISKS: &str = "disks: 2D Gaussians, whose third scale is not rendered";
 
 pub use rows::replace_rows;
+pub use surface::{read_surface_model, surface_from_bytes, surface_from_rows, surface_to_bytes};
 pub use write::{SplatWriter, to_bytes, write_model, write_whole};
 
 /// The properties of a row for a degree of the spherical harmonics.

@@ -13,6 +13,7 @@ use super::Layout;
 use super::header::{Element, Format, Header, Scalar};
 use crate::gaussians::Gaussians;
 use crate::gpu::Drawing;
+use crate::surface::SurfaceRecord;
 use crate::water::WaterRecord;
 use crate::{CoreError, Result};
 
@@ -319,16 +320,21 @@ pub fn from_bytes(bytes: &[u8], name: &str) -> Result<Gaussians> {
     SplatReader::from_bytes(bytes, name).and_then(read_all)
 }
 
+/// Of a scene with a water surface, the scene without it.
 fn read_all<R: Read>(mut reader: SplatReader<R>) -> Result<Gaussians> {
+    if SurfaceRecord::among(reader.comments())?.is_some() {
+        let model = super::surface::read(reader)?;
+        return model.map(|model| model.dry()).ok_or_else(|| CoreError::Scene("a model changed".into()));
+    }
     let empty = Gaussians::empty(reader.layout.sh_degree());
     Ok(reader.next_block(usize::MAX)?.unwrap_or(empty))
 }
 
-fn float(row: &[u8], index: usize) -> f32 {
+pub(super) fn float(row: &[u8], index: usize) -> f32 {
     f32::from_le_bytes([row[index * 4], row[index * 4 + 1], row[index * 4 + 2], row[index * 4 + 3]])
 }
 
-fn push_gaussian(gaussians: &mut Gaussians, layout: Layout, row: &[u8]) {
+pub(super) fn push_gaussian(gaussians: &mut Gaussians, layout: Layout, row: &[u8]) {
     let at = |index: usize| float(row, index);
     let rest = layout.rest_per_channel();
     gaussians.means.push([at(0), at(1), at(2)]);

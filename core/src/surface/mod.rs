@@ -4,13 +4,17 @@
 //! it splits into a reflected and a refracted ray ([`optics`]). [`surface_prior`] finds the plane from the
 //! tracks of structure from motion, before any training, and sorts the sparse points into wet and dry ones.
 
+mod model;
 pub mod optics;
 mod prior;
+mod record;
 
+pub use model::SurfaceModel;
 pub use optics::{AIR, Surface, WATER};
 pub use prior::{
     SurfaceError, SurfaceOptions, SurfacePrior, SurfaceStandardErrors, SurfaceStart, WetPoint, surface_prior,
 };
+pub use record::{SurfaceRecord, SurfaceSource};
 
 #[cfg(test)]
 mod tests;

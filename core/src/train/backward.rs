@@ -2,7 +2,9 @@
 
 use crate::appearance::chain::{Appearance, SplatGradients};
 use crate::config::Moments;
-use crate::gpu::{Block, BlockTraining, Blocks, Frame, FrameUniform, Gpu, Recorder, Size, counter};
+use crate::gpu::{
+    Block, BlockTraining, Blocks, Frame, FrameUniform, Gpu, Recorder, Size, SurfaceRays, counter,
+};
 use crate::memory;
 use crate::{CoreError, Result};
 
@@ -15,8 +17,10 @@ pub struct BackwardBuffers<'a> {
     pub v_range: &'a wgpu::Buffer,
     /// `[intersections*3]` vec4: gradients of the splats in each tile; of disks `[intersections*5]`.
     pub slot_gradients: &'a wgpu::Buffer,
-    /// Of a frame of disks.
+    /// Of a frame of disks that are seen from the eye.
     pub disks: Option<DiskBuffers<'a>>,
+    /// Of a frame of disks that are seen at a water surface. Gradients of the picture are then those here.
+    pub traced: Option<TracedBuffers<'a>>,
     /// `StepUniform`.
     pub step: &'a wgpu::Buffer,
     /// Appearances whose parameters move with the Gaussians.
@@ -30,6 +34,37 @@ pub struct DiskBuffers<'a> {
     pub v_normal: &'a wgpu::Buffer,
     /// `[H*W*2]` vec4, written here: what the backward pass needs of each pixel.
     pub v_pixels: &'a wgpu::Buffer,
+    /// `[H*W]`: gradient of the loss with respect to the blended masks.
+    pub v_mask: &'a wgpu::Buffer,
+}
+
+/// Buffers of the backward pass of disks that are seen at a water surface.
+#[derive(Clone, Copy)]
+pub struct TracedBuffers<'a> {
+    /// `[H*W]` vec4: gradient with respect to the blended colour, and its sum over all disks
+    /// (`surface_compose_backward.wgsl`).
+    pub v_pixels: &'a wgpu::Buffer,
+    /// `[H*W*2]` vec4, written here: gradients of the origin and the direction of each ray.
+    pub v_rays: &'a wgpu::Buffer,
+}
+
+/// The kernel that takes the step of the Gaussians of `frame`.
+fn step_kernel(frame: &Frame, kind: Moments, in_bands: bool) -> &'static str {
+    let refracted = frame.rays() == Some(SurfaceRays::Refracted);
+    match (frame.disks.is_some(), refracted, in_bands, kind) {
+        (false, _, false, Moments::Compact) => "project_backward",
+        (false, _, false, Moments::F32) => "project_backward_f32",
+        (false, _, true, Moments::Compact) => "project_backward_bands",
+        (false, _, true, Moments::F32) => "project_backward_bands_f32",
+        (true, false, false, Moments::Compact) => "project_disks_backward",
+        (true, false, false, Moments::F32) => "project_disks_backward_f32",
+        (true, false, true, Moments::Compact) => "project_disks_backward_bands",
+        (true, false, true, Moments::F32) => "project_disks_backward_bands_f32",
+        (true, true, false, Moments::Compact) => "project_refracted_backward",
+        (true, true, false, Moments::F32) => "project_refracted_backward_f32",
+        (true, true, true, Moments::Compact) => "project_refracted_backward_bands",
+        (true, true, true, Moments::F32) => "project_refracted_backward_bands_f32",
+    }
 }
 
 /// Records the backward pass and the step of a view that [`Frame::record_forward`] rendered whole.
@@ -50,12 +85,7 @@ pub fn record_backward(
         appearance.record_gradients(gpu, recorder, splats)?;
     }
     for (index, block, training) in blocks.trainable() {
-        let kernel = match (training.kind, buffers.disks.is_some()) {
-            (Moments::Compact, false) => "project_backward",
-            (Moments::F32, false) => "project_backward_f32",
-            (Moments::Compact, true) => "project_disks_backward",
-            (Moments::F32, true) => "project_disks_backward_f32",
-        };
+        let kernel = step_kernel(frame, training.kind, false);
         let groups = Size::Indirect(&frame.args, counter::ARGS_BLOCK + index as u32);
         let sources = [
             ("gaussian_from_visible", &frame.gaussian_from_visible),
@@ -85,7 +115,7 @@ pub fn record_backward_in_bands(
     bands: &[FrameUniform],
     buffers: BackwardBuffers<'_>,
 ) -> Result<()> {
-    let row_bytes = memory::slot_bytes(buffers.disks.is_some());
+    let row_bytes = memory::slot_bytes(frame.disks.is_some());
     for (_, block, training) in blocks.trainable() {
         recorder.clear(training.band_gradients(gpu, block.capacity, row_bytes)?);
     }
@@ -94,7 +124,7 @@ pub fn record_backward_in_bands(
         record_rasterize(recorder, frame, band, buffers)?;
         for (index, block, training) in blocks.trainable() {
             recorder.dispatch(
-                if buffers.disks.is_some() { "add_disk_band_gradients" } else { "add_band_gradients" },
+                if frame.disks.is_some() { "add_disk_band_gradients" } else { "add_band_gradients" },
                 Size::Indirect(&frame.args, counter::ARGS_BLOCK + index as u32),
                 &[
                     ("frame", &frame.uniform),
@@ -117,12 +147,7 @@ pub fn record_backward_in_bands(
         appearance.record_gradients(gpu, recorder, splats)?;
     }
     for (_, block, training) in blocks.trainable() {
-        let kernel = match (training.kind, buffers.disks.is_some()) {
-            (Moments::Compact, false) => "project_backward_bands",
-            (Moments::F32, false) => "project_backward_bands_f32",
-            (Moments::Compact, true) => "project_disks_backward_bands",
-            (Moments::F32, true) => "project_disks_backward_bands_f32",
-        };
+        let kernel = step_kernel(frame, training.kind, true);
         let sources = [("band_gradients", training.band_gradients(gpu, block.capacity, row_bytes)?)];
         let groups = Size::Items(block.count, 64);
         record_step(recorder, kernel, groups, frame, block, training, &sources, buffers.step)?;
@@ -141,6 +166,9 @@ fn record_rasterize(
     buffers: BackwardBuffers<'_>,
 ) -> Result<()> {
     let targets = frame.targets()?;
+    if let Some(traced) = buffers.traced {
+        return record_trace(recorder, frame, band, buffers, traced);
+    }
     if let Some(disks) = buffers.disks {
         return record_rasterize_disks(recorder, frame, band, buffers, disks);
     }
@@ -185,6 +213,7 @@ fn record_rasterize_disks(
             ("v_image", buffers.v_image),
             ("v_range_image", buffers.v_range),
             ("v_normal_image", of_disks.v_normal),
+            ("v_mask_image", of_disks.v_mask),
             ("v_pixels", of_disks.v_pixels),
         ],
     )?;
@@ -200,6 +229,37 @@ fn record_rasterize_disks(
             ("ranges", &targets.ranges),
             ("tile_ends", &targets.tile_ends),
             ("v_pixels", of_disks.v_pixels),
+            ("v_mask_image", of_disks.v_mask),
+            ("slot_gradients", buffers.slot_gradients),
+        ],
+    )
+}
+
+fn record_trace(
+    recorder: &mut Recorder<'_>,
+    frame: &Frame,
+    band: &FrameUniform,
+    buffers: BackwardBuffers<'_>,
+    traced: TracedBuffers<'_>,
+) -> Result<()> {
+    let targets = frame.targets()?;
+    let (Some(disks), Some(rays)) = (&frame.disks, &targets.rays) else {
+        return Err(CoreError::Gpu("rays at a water surface need a frame of them".into()));
+    };
+    recorder.dispatch(
+        "trace_disks_backward",
+        Size::Groups(band.end_tile - band.first_tile),
+        &[
+            ("frame", &frame.uniform),
+            ("projected", &frame.projected),
+            ("disks", disks),
+            ("slots", frame.sorted_slots(band.tile_count())),
+            ("visible_from_slot", &frame.visible_from_slot),
+            ("ranges", &targets.ranges),
+            ("tile_ends", &targets.tile_ends),
+            ("v_pixels", traced.v_pixels),
+            ("rays", rays),
+            ("v_rays", traced.v_rays),
             ("slot_gradients", buffers.slot_gradients),
         ],
     )
@@ -229,5 +289,6 @@ fn record_step(
         ("water", &frame.water),
     ];
     bound.extend_from_slice(sources);
+    bound.extend(frame.bound_refraction());
     recorder.dispatch(kernel, groups, &bound)
 }

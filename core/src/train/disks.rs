@@ -15,6 +15,8 @@ pub struct DiskMaps {
     uniform: wgpu::Buffer,
     pixels: u64,
     v_normal: wgpu::Buffer,
+    /// Zeros, unless the run has a water surface.
+    v_mask: wgpu::Buffer,
     /// First the gradients of slopes, then what the backward pass needs of each pixel.
     v_pixels: wgpu::Buffer,
 }
@@ -29,6 +31,7 @@ impl DiskMaps {
             uniform: gpu.uniform("normals", &NormalsUniform::default()),
             pixels: 0,
             v_normal: gpu.buffer("gradient of normals", 16)?,
+            v_mask: gpu.buffer("gradient of masks", 4)?,
             v_pixels: gpu.buffer("pixel gradients", 32)?,
         })
     }
@@ -41,6 +44,7 @@ impl DiskMaps {
         let pixels = u64::from(size[0]) * u64::from(size[1]);
         if pixels > self.pixels {
             self.v_normal = gpu.buffer("gradient of normals", 16 * pixels)?;
+            self.v_mask = gpu.buffer("gradient of masks", 4 * pixels)?;
             self.v_pixels = gpu.buffer("pixel gradients", 32 * pixels)?;
             self.pixels = pixels;
         }
@@ -49,7 +53,7 @@ impl DiskMaps {
 
     /// For the backward pass.
     pub fn buffers(&self) -> DiskBuffers<'_> {
-        DiskBuffers { v_normal: &self.v_normal, v_pixels: &self.v_pixels }
+        DiskBuffers { v_normal: &self.v_normal, v_pixels: &self.v_pixels, v_mask: &self.v_mask }
     }
 
     /// Records the normal consistency with this weight per pixel. It sets the gradient of the normals, and

@@ -91,7 +91,7 @@ impl Trainer {
         let mut chosen = kept.iter().peekable();
         let (focus, _) = model.split_where(|index| chosen.next_if(|row| **row == index).is_some());
         let config = TrainConfig { max_gaussians: share(most).max(focus.len() as u32), ..config };
-        let run = TrainRun { config, extent, views, focus, context, surfaces, medium };
+        let run = TrainRun { config, extent, views, focus, context, surfaces, medium, surface: None };
         let mut trainer = Self::new(gpu, run)?;
         trainer.take_rows(&rows);
         trainer.take_extras(&extras, network.as_deref())?;

@@ -7,7 +7,7 @@ use std::sync::Arc;
 
 use super::Trainer;
 use crate::Result;
-use crate::gpu::{Output, Renderer, WaterView};
+use crate::gpu::{Output, Rendered, Renderer, WaterView};
 use crate::metrics::{psnr, quantised, ssim};
 use crate::scene::{PinholeCamera, Pose};
 use crate::views::ViewSource;
@@ -89,29 +89,42 @@ impl Trainer {
         let mut renderer = Renderer::new(Arc::clone(&self.gpu), &model)?
             .drawn(self.config.drawing())?
             .with_water(self.water_view()?);
-        let mut measured = Vec::new();
-        for (index, view) in held_out.views().iter().enumerate() {
-            if !go_on() {
-                measured.clear();
-                break;
-            }
-            let truth = held_out.load(index)?;
-            let rendered = renderer.render(&view.camera, &view.pose, [0.0; 3])?;
-            let render = quantised(rendered.width, rendered.height, &rendered.rgb);
-            measured.push((psnr(&render, &truth), ssim(&render, &truth)));
-        }
+        let found =
+            measured(iteration, held_out, go_on, |camera, pose| renderer.render(camera, pose, [0.0; 3]));
         drop(renderer);
         self.gpu.release_unused()?;
-        if measured.is_empty() {
-            return Ok(None);
-        }
-        Ok(Some(HeldOutMetrics {
-            iteration,
-            psnr_db: mean(measured.iter().map(|(psnr, _)| *psnr)),
-            ssim: mean(measured.iter().map(|(_, ssim)| *ssim)),
-            views: measured.len() as u32,
-        }))
+        found
     }
+}
+
+/// Compares what `render` gives with the `held_out` views. `None` if there are no views, or if `go_on`, which
+/// is called before each view, returns false.
+pub(super) fn measured(
+    iteration: u32,
+    held_out: &dyn ViewSource,
+    go_on: impl Fn() -> bool,
+    mut render: impl FnMut(&PinholeCamera, &Pose) -> Result<Rendered>,
+) -> Result<Option<HeldOutMetrics>> {
+    let mut measured = Vec::new();
+    for (index, view) in held_out.views().iter().enumerate() {
+        if !go_on() {
+            measured.clear();
+            break;
+        }
+        let truth = held_out.load(index)?;
+        let rendered = render(&view.camera, &view.pose)?;
+        let render = quantised(rendered.width, rendered.height, &rendered.rgb);
+        measured.push((psnr(&render, &truth), ssim(&render, &truth)));
+    }
+    if measured.is_empty() {
+        return Ok(None);
+    }
+    Ok(Some(HeldOutMetrics {
+        iteration,
+        psnr_db: mean(measured.iter().map(|(psnr, _)| *psnr)),
+        ssim: mean(measured.iter().map(|(_, ssim)| *ssim)),
+        views: measured.len() as u32,
+    }))
 }
 
 fn mean(values: impl Iterator<Item = f64>) -> f64 {

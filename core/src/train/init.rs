@@ -52,7 +52,7 @@ pub fn initial_gaussians(
 }
 
 /// Turns disks at random, as 2DGS does: no direction is preferred.
-fn turn(model: &mut Gaussians, seed: u32) {
+pub(super) fn turn(model: &mut Gaussians, seed: u32) {
     let number = |index: u32, k: u32| random_bits(seed, Stream::Turn, index, k).map(uniform);
     for (quat, index) in model.quats.iter_mut().zip(0..) {
         // Uniform over all rotations (Shoemake 1992).

@@ -116,6 +116,7 @@ impl Trainer {
             v_range: self.loss.v_range()?,
             slot_gradients: &self.slot_gradients,
             disks: self.disks.as_ref().map(DiskMaps::buffers),
+            traced: None,
             step: &self.step,
             appearances: &self.appearances.stepped_with_gaussians(&now),
         };

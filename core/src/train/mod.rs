@@ -22,6 +22,7 @@ mod results;
 mod schedule;
 mod smoothing;
 mod start;
+pub mod surface;
 mod surfaces;
 mod target_images;
 
@@ -32,7 +33,7 @@ use crate::appearance::Settings;
 use crate::appearance::chain::{Chain, Start};
 use crate::config::{LossLight, TrainConfig};
 use crate::gaussians::Gaussians;
-use crate::gpu::{Blocks, Frame, Gpu, StepUniform, spatial_order};
+use crate::gpu::{Blocks, Frame, Gpu, StepUniform, SurfaceRays, spatial_order};
 use crate::memory::BATCH;
 use crate::views::ViewSource;
 use crate::{CoreError, Result};
@@ -43,7 +44,7 @@ pub use crate::appearance::water::{
     DeviceMedium, DevicePriors, Gathered, MediumRun, NetworkRun, PriorMaps, WaterStep,
 };
 pub use crate::gpu::DevicePhotograph;
-pub use backward::{BackwardBuffers, DiskBuffers, record_backward, record_backward_in_bands};
+pub use backward::{BackwardBuffers, DiskBuffers, TracedBuffers, record_backward, record_backward_in_bands};
 pub use disks::{DiskMaps, LEAST_ALPHA};
 pub use handover::Surroundings;
 pub use held_out::{HeldOutMetrics, Preview};
@@ -75,6 +76,8 @@ pub struct TrainRun {
     pub surfaces: Gaussians,
     /// The water between cameras and scene; `None` trains in sRGB without water.
     pub medium: Option<MediumRun>,
+    /// The water surface that cameras look at; for method `wsgs` only.
+    pub surface: Option<surface::SurfaceRun>,
 }
 
 /// Progress of a run.
@@ -121,6 +124,9 @@ pub struct Trainer {
     predictor: Option<Predictor>,
     /// Set if the Gaussians are disks.
     disks: Option<DiskMaps>,
+    /// Whether the third number of a disk is the logit of its mask, not a scale (a scene with a water
+    /// surface).
+    masked: bool,
     /// Set if there are surfaces that must stay covered.
     surfaces: Option<Surfaces>,
     slot_gradients: wgpu::Buffer,
@@ -131,6 +137,18 @@ pub struct Trainer {
     /// Gaussians in focus at the start of the run: growth is geometric from here.
     initial: u32,
     last_loss: f32,
+}
+
+/// What a trainer trains.
+#[derive(Clone, Copy, PartialEq)]
+enum Part<'a> {
+    /// A scene.
+    Whole,
+    /// Of a scene with a water surface, the disks that cameras see straight. Their third numbers are the
+    /// logits of their masks.
+    Straight,
+    /// Of such a scene, the disks that they see by these rays at the surface.
+    AtSurface(SurfaceRays, &'a wgpu::Buffer),
 }
 
 impl TrainRun {
@@ -150,6 +168,10 @@ impl Trainer {
     /// # Errors
     /// When there are no views, no Gaussians, or the device cannot hold them.
     pub fn new(gpu: Arc<Gpu>, run: TrainRun) -> Result<Self> {
+        Self::of_part(gpu, run, Part::Whole)
+    }
+
+    fn of_part(gpu: Arc<Gpu>, run: TrainRun, part: Part<'_>) -> Result<Self> {
         if run.views.views().is_empty() {
             return Err(CoreError::Scene("there are no views to train on".into()));
         }
@@ -159,10 +181,10 @@ impl Trainer {
             ));
         }
         let run_digest = checkpoint::run_digest(&run);
-        let TrainRun { config, extent, views, focus, context, surfaces, medium } = run;
+        let TrainRun { config, extent, views, focus, context, surfaces, medium, surface: _ } = run;
         let medium = medium.map(|medium| medium.times(config.loss_factor));
         let mut focus = init::limit(focus, config.max_gaussians, config.seed);
-        if config.disks {
+        if config.disks && part != Part::Straight {
             focus.flatten();
         }
         let surfaces = Surfaces::new(surfaces, &context)?;
@@ -177,6 +199,9 @@ impl Trainer {
         let mut disks = None;
         if config.disks {
             frame = frame.of_disks(&gpu)?;
+            if let Part::AtSurface(rays, plane) = part {
+                frame = frame.at_surface(&gpu, rays, plane)?;
+            }
             disks = Some(DiskMaps::new(&gpu)?);
         }
         let slot_gradients = slot_gradients(&gpu, &frame)?;
@@ -202,6 +227,10 @@ impl Trainer {
         for view in views.views() {
             let size = [view.camera.width, view.camera.height];
             frame.prepare_targets(&gpu, size)?;
+            if matches!(part, Part::AtSurface(..)) {
+                // Its pictures are parts of another.
+                continue;
+            }
             loss.prepare(&gpu, size)?;
             appearances.prepare(&gpu, size)?;
             if let Some(disks) = &mut disks {
@@ -215,6 +244,7 @@ impl Trainer {
             appearances,
             predictor,
             disks,
+            masked: part == Part::Straight,
             surfaces,
             targets: TargetImages::new(views, config.seed, config.prefetch_threads).evictable_on(&gpu),
             initial: focus.len() as u32,

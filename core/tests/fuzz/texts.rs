@@ -56,6 +56,7 @@ fn fuzzed_configurations_are_refused_or_survive_the_store() {
         whole(Preset::Fathom),
         whole(Preset::Splatting),
         whole(Preset::Disks),
+        whole(Preset::Surface),
     ];
     let read = |bytes: &[u8]| {
         let Ok(text) = std::str::from_utf8(bytes) else { return false };

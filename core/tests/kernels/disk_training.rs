@@ -81,7 +81,12 @@ fn disagreement(gpu: &Arc<Gpu>, model: &Gaussians, photographs: &InMemory) -> f6
         };
         let normal: Vec<[f64; 3]> = normals.iter().map(|n| n.map(f64::from)).collect();
         let rays = pinhole_rays(&view.camera);
-        let found = normal_consistency(&DiskRaster { raster, normal: normal.clone() }, &rays, 1.0, 0.8);
+        let found = normal_consistency(
+            &DiskRaster { raster, normal: normal.clone(), ..DiskRaster::default() },
+            &rays,
+            1.0,
+            0.8,
+        );
         for (surface, normal) in found.v_normal.iter().zip(&normal) {
             let cosine: f64 = -surface.iter().zip(normal).map(|(a, b)| a * b).sum::<f64>();
             if *surface != [0.0; 3] && *normal != [0.0; 3] {

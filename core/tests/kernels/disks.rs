@@ -10,8 +10,8 @@ use fathom_core::gpu::{Gpu, Recorder, counter};
 use fathom_core::rng::{Stream, uniform_at};
 use fathom_core::train::{BackwardBuffers, DiskBuffers, DiskMaps, LEAST_ALPHA, record_backward};
 use fathom_twins::{
-    Disk, DiskGradient, DiskRaster, DiskRasterGradients, DiskRay, Gaussians64, Raster, RasterGradients,
-    RasterRules, TileLists, bounds_of, intersect, normal_consistency, pinhole_rays, project_disks,
+    Disk, DiskGradient, DiskRaster, DiskRasterGradients, DiskRay, Gaussians64, Raster, RasterRules, Sight,
+    Splat, TileLists, bounds_of, intersect, normal_consistency, pinhole_rays, project_disks,
     project_disks_backward, samples, trace_backward, trace_forward,
 };
 use glam::DVec3;
@@ -32,7 +32,7 @@ struct Compared {
 impl Compared {
     fn new(gpu: &Arc<Gpu>, scene: &Scene) -> Self {
         let view = View::render_disks(gpu, scene);
-        let disks = projected(&view);
+        let disks = projected(&view, &Sight::straight(&scene.pose));
         let (width, height) = (scene.camera.width, scene.camera.height);
         let lists = intersect(&bounds_of(&disks), width, height);
         let rays = pinhole_rays(&scene.camera);
@@ -43,28 +43,38 @@ impl Compared {
     }
 }
 
-/// The disks in the camera's frame, as the kernel wrote them.
-fn projected(view: &View) -> Vec<Option<Disk>> {
+/// The disks in the camera's frame, as the kernel wrote them, of a view that sees them by `sight`.
+pub fn projected(view: &View, sight: &Sight) -> Vec<Option<Disk>> {
     let visible = view.visible();
     let of_frame = view.frame.disks.as_ref().unwrap();
     let records: Vec<[f32; 12]> = view.gpu.read(of_frame, 0, visible.len()).unwrap();
+    let splats: Vec<[f32; 12]> = view.gpu.read(&view.frame.projected, 0, visible.len()).unwrap();
     let bounds = view.splats();
     let mut disks = vec![None; bounds.len()];
-    for (&id, record) in visible.iter().zip(&records) {
+    for ((&id, record), splat) in visible.iter().zip(&records).zip(&splats) {
         let r = record.map(f64::from);
+        let centre = DVec3::new(r[0], r[1], r[2]);
         let axes = [DVec3::new(r[4], r[5], r[6]), DVec3::new(r[8], r[9], r[10])];
         disks[id] = bounds[id].map(|bound| Disk {
-            centre: DVec3::new(r[0], r[1], r[2]),
+            centre,
             axes,
             normal: r[11] * axes[0].cross(axes[1]),
             centre2d: [r[3], r[7]],
-            bound,
+            mask: splat[11].into(),
+            bound: Splat { depth: sight.depth(centre), ..bound },
         });
     }
     disks
 }
 
-fn is_decided(disks: &[Option<Disk>], lists: &TileLists, rays: &[DiskRay], width: u32, pixel: usize) -> bool {
+/// Whether no disk is near a decision at a pixel.
+pub fn is_decided(
+    disks: &[Option<Disk>],
+    lists: &TileLists,
+    rays: &[DiskRay],
+    width: u32,
+    pixel: usize,
+) -> bool {
     let (x, y) = (pixel as u32 % width, pixel as u32 / width);
     let rules = RasterRules::HARD;
     let mut left = 1.0;
@@ -72,22 +82,23 @@ fn is_decided(disks: &[Option<Disk>], lists: &TileLists, rays: &[DiskRay], width
         let Some(disk) = &disks[id as usize] else { continue };
         let [a_u, a_v] = disk.axes;
         let normal = a_u.cross(a_v);
-        let t = normal.dot(disk.centre) / normal.dot(rays[pixel].direction);
-        let p = t * rays[pixel].direction - disk.centre;
+        let DiskRay { origin, direction, nearest } = rays[pixel];
+        let t = normal.dot(disk.centre - origin) / normal.dot(direction);
+        let p = origin + t * direction - disk.centre;
         let solid = a_u.dot(p).powi(2) + a_v.dot(p).powi(2);
         let delta = [disk.centre2d[0] - f64::from(x) - 0.5, disk.centre2d[1] - f64::from(y) - 0.5];
         let thin = 2.0 * (delta[0].powi(2) + delta[1].powi(2));
-        let is_hit = t > 0.01 && solid <= thin;
+        let is_hit = t > nearest && solid <= thin;
         let full = disk.bound.opacity * (-0.5 * if is_hit { solid } else { thin }).exp();
         let near = |value: f64, edge: f64| (value / edge - 1.0).abs() < 5e-3;
         let seen = full > 0.5 * rules.min_alpha || disk.bound.opacity * (-0.5 * solid).exp() > 1e-3;
         // Rounding moves the hit on a plane that is seen from its edge by more than the disk.
-        let slant =
-            normal.dot(rays[pixel].direction).abs() / (normal.length() * rays[pixel].direction.length());
+        let slant = normal.dot(direction).abs() / (normal.length() * direction.length());
         if seen
             && (near(full, rules.min_alpha)
                 || near(full, rules.max_alpha)
                 || near(solid, thin)
+                || (t - nearest).abs() < 1e-4
                 || slant < 2e-3)
         {
             return false;
@@ -146,6 +157,7 @@ fn pictures_of_disks_match_the_twin() {
                 let pairs = (0..3)
                     .map(|c| (pixel[c], twin.raster.rgb[i][c], 1e-4))
                     .chain((0..3).map(|c| (normal[c], twin.normal[i][c], 1e-4)))
+                    .chain([(normal[3], twin.mask[i], 1e-4)])
                     .chain([(pixel[3], twin.raster.alpha[i], 1e-4)])
                     .chain([(f64::from(range[i]), twin.raster.range[i], 5e-4)]);
                 for (n, (kernel, twin, tolerance)) in pairs.enumerate() {
@@ -165,7 +177,7 @@ fn disks_are_projected_as_the_twin_does() {
     for gpu in layouts() {
         for scene in scenes(252, 300, 2) {
             let view = View::render_disks(&gpu, &scene);
-            let kernel = projected(&view);
+            let kernel = projected(&view, &Sight::straight(&scene.pose));
             let model = Gaussians64::from(&scene.model);
             let twin = project_disks(&model, &scene.camera, &scene.pose, 2, &RasterRules::HARD);
             let mut compared = 0;
@@ -184,6 +196,7 @@ fn disks_are_projected_as_the_twin_does() {
                         && along(kernel.axes[0], twin.axes[0])
                         && along(kernel.axes[1], twin.axes[1])
                         && along(kernel.normal, twin.normal)
+                        && close(kernel.mask, twin.mask, 1.0)
                         && close(kernel.bound.mean2d[0], twin.bound.mean2d[0], 100.0 + width)
                         && close(kernel.bound.half_size[0], twin.bound.half_size[0], 10.0 * width)
                         && close(kernel.bound.half_size[1], twin.bound.half_size[1], 10.0 * height)
@@ -197,32 +210,39 @@ fn disks_are_projected_as_the_twin_does() {
     }
 }
 
-/// The gradients of the decided pixels, at random.
-fn weights(compared: &Compared) -> (ImageGradients, Vec<[f32; 4]>, DiskRasterGradients) {
+/// Gradients of the decided pixels, for the kernels and for the twin.
+struct Weights {
+    images: ImageGradients,
+    normal: Vec<[f32; 4]>,
+    mask: Vec<f32>,
+    twin: DiskRasterGradients,
+}
+
+/// At random.
+fn weights(compared: &Compared) -> Weights {
     let pixels = compared.decided.len();
-    let mut v = ImageGradients::random(253, pixels);
-    let mut normal: Vec<[f32; 4]> = (0..pixels as u32)
-        .map(|i| std::array::from_fn(|c| 2.0 * uniform_at(254, Stream::Test, i, c as u32) - 1.0))
-        .collect();
+    let mut images = ImageGradients::random(253, pixels);
+    let u = |i, c| 2.0 * uniform_at(254, Stream::Test, i, c) - 1.0;
+    let mut normal: Vec<[f32; 4]> =
+        (0..pixels as u32).map(|i| std::array::from_fn(|c| u(i, c as u32))).collect();
+    let mut mask: Vec<f32> = (0..pixels as u32).map(|i| u(i, 4)).collect();
     for i in (0..pixels).filter(|&i| !compared.decided[i]) {
-        (v.image[i], v.range[i], normal[i]) = ([0.0; 4], 0.0, [0.0; 4]);
+        (images.image[i], images.range[i]) = ([0.0; 4], 0.0);
+        (normal[i], mask[i]) = ([0.0; 4], 0.0);
     }
     let twin = DiskRasterGradients {
-        raster: RasterGradients {
-            rgb: v.image.iter().map(|v| [v[0], v[1], v[2]].map(f64::from)).collect(),
-            alpha: v.image.iter().map(|v| f64::from(v[3])).collect(),
-            range: v.range.iter().map(|&v| f64::from(v)).collect(),
-        },
+        raster: images.in_f64(),
         normal: normal.iter().map(|v| [v[0], v[1], v[2]].map(f64::from)).collect(),
+        mask: mask.iter().map(|&v| v.into()).collect(),
     };
-    (v, normal, twin)
+    Weights { images, normal, mask, twin }
 }
 
 /// Runs the backward pass, and returns the gradients of the slots.
-fn backward(compared: &Compared, v: &ImageGradients, v_normal: &[[f32; 4]]) -> Vec<[f32; 20]> {
+fn backward(compared: &Compared, v: &Weights) -> Vec<[f32; 20]> {
     let (view, gpu) = (&compared.view, &compared.view.gpu);
-    let [v_image, v_normal] = [&v.image, v_normal].map(|rows| storage(gpu, rows));
-    let v_range = storage(gpu, &v.range);
+    let [v_image, v_normal] = [&v.images.image, &v.normal].map(|rows| storage(gpu, rows));
+    let [v_range, v_mask] = [&v.images.range, &v.mask].map(|rows| storage(gpu, rows));
     let step = gpu.uniform("step", &gradients_only());
     let intersections = view.counter(counter::INTERSECTIONS);
     let slots = gpu.buffer("slot gradients", 80 * (intersections as u64).max(1)).unwrap();
@@ -233,7 +253,8 @@ fn backward(compared: &Compared, v: &ImageGradients, v_normal: &[[f32; 4]]) -> V
         v_image: &v_image,
         v_range: &v_range,
         slot_gradients: &slots,
-        disks: Some(DiskBuffers { v_normal: &v_normal, v_pixels: &v_pixels }),
+        disks: Some(DiskBuffers { v_normal: &v_normal, v_pixels: &v_pixels, v_mask: &v_mask }),
+        traced: None,
         step: &step,
         appearances: &[],
     };
@@ -243,9 +264,8 @@ fn backward(compared: &Compared, v: &ImageGradients, v_normal: &[[f32; 4]]) -> V
     gpu.read(&slots, 0, intersections).unwrap()
 }
 
-fn numbers(g: &DiskGradient) -> [f64; 20] {
-    let DiskGradient { uv, tau, products, tau_uv, centre2d, range, normal, rgb, opacity, abs, contribution } =
-        g;
+pub fn numbers(g: &DiskGradient) -> [f64; 20] {
+    let DiskGradient { uv, tau, products, tau_uv, centre2d, range, normal, rgb, mask, opacity, abs, .. } = g;
     [
         uv[0],
         uv[1],
@@ -266,11 +286,11 @@ fn numbers(g: &DiskGradient) -> [f64; 20] {
         rgb[0],
         rgb[1],
         rgb[2],
-        *contribution,
+        *mask,
     ]
 }
 
-fn from_numbers(g: [f64; 20]) -> DiskGradient {
+pub fn from_numbers(g: [f64; 20]) -> DiskGradient {
     DiskGradient {
         uv: [g[0], g[1]],
         tau: g[2],
@@ -282,12 +302,13 @@ fn from_numbers(g: [f64; 20]) -> DiskGradient {
         range: g[14],
         abs: g[15],
         rgb: [g[16], g[17], g[18]],
-        contribution: g[19],
+        mask: g[19],
+        contribution: 0.0,
     }
 }
 
 /// Sums of slots by Gaussian, and the sums of their absolute values.
-fn sums(view: &View, slots: &[[f32; 20]]) -> Vec<([f64; 20], [f64; 20])> {
+pub fn sums(view: &View, slots: &[[f32; 20]]) -> Vec<([f64; 20], [f64; 20])> {
     let visible = view.visible();
     let segments: Vec<[u32; 2]> = view.gpu.read(&view.frame.segments, 0, visible.len()).unwrap();
     let mut sums = vec![([0.0; 20], [0.0; 20]); view.blocks.total() as usize];
@@ -307,12 +328,12 @@ fn gradients_of_disks_match_the_twin() {
     for gpu in layouts() {
         for scene in scenes(255, 250, 0) {
             let compared = Compared::new(&gpu, &scene);
-            let (v, v_normal, v_twin) = weights(&compared);
+            let v = weights(&compared);
             let Compared { view, disks, lists, rays, twin, .. } = &compared;
             let (camera, background) = (&scene.camera, scene.background64());
             let rules = RasterRules::HARD;
-            let expected = trace_backward(disks, lists, rays, camera, twin, background, &rules, &v_twin);
-            let kernel = sums(view, &backward(&compared, &v, &v_normal));
+            let expected = trace_backward(disks, lists, rays, camera, twin, background, &rules, &v.twin);
+            let kernel = sums(view, &backward(&compared, &v));
             let mut seen = 0;
             for (id, (expected, (kernel, sizes))) in expected.iter().zip(&kernel).enumerate() {
                 seen += usize::from(expected.contribution > 0.01);
@@ -331,63 +352,73 @@ fn gradients_of_disks_match_the_twin() {
     }
 }
 
+/// Asserts that gradients of parameters are those of the twin. Returns the number of disks that are seen.
+pub fn assert_parameters(
+    scene: &str,
+    kernel: &Gaussians64,
+    twin: &Gaussians64,
+    disks: &[Option<Disk>],
+    v_disks: &[DiskGradient],
+) -> usize {
+    let mut seen = 0;
+    for (id, disk) in disks.iter().enumerate() {
+        let Some(disk) = disk else { continue };
+        seen += usize::from(v_disks[id].rgb != [0.0; 3]);
+        for (kind, from, to) in [
+            ("mean", 0, 3),
+            ("quaternion", 3, 7),
+            ("log scale", 7, 9),
+            ("mask", 9, 10),
+            ("opacity", 10, 11),
+            ("colour", 11, twin.parameters()),
+        ] {
+            let length = |of: &dyn Fn(usize) -> f64| (from..to).map(|p| of(p).powi(2)).sum::<f64>().sqrt();
+            let difference = length(&|p| kernel.parameter(id, p) - twin.parameter(id, p));
+            // Sums that cancel, by the longer axis: the largest of what they are made of.
+            let g = v_disks[id];
+            let longest = disk.axes.map(|axis| axis.length());
+            let steep = longest[0] * longest[1];
+            let parts = match kind {
+                "mean" => {
+                    steep * g.tau.abs()
+                        + longest[0] * g.uv[0].abs()
+                        + longest[1] * g.uv[1].abs()
+                        + 100.0 * (g.centre2d[0].abs() + g.centre2d[1].abs())
+                        + g.range.abs()
+                        + g.rgb.iter().map(|v| v.abs()).sum::<f64>()
+                }
+                "quaternion" | "log scale" => {
+                    let ratio = (longest[0] / longest[1]).max(longest[1] / longest[0]);
+                    ratio * g.products.iter().map(|v| v.abs()).sum::<f64>()
+                        + longest[0].max(longest[1]) * (g.tau_uv[0].abs() + g.tau_uv[1].abs())
+                        + g.normal[0].abs()
+                        + g.normal[1].abs()
+                }
+                _ => 0.0,
+            };
+            let tolerance = 1e-4 * (length(&|p| twin.parameter(id, p)) + parts) + 1e-9;
+            assert!(
+                difference <= tolerance,
+                "{scene}: {kind} of disk {id}: difference {difference:e}, tolerance {tolerance:e}"
+            );
+        }
+    }
+    seen
+}
+
 #[test]
 fn parameters_of_disks_get_the_gradients_of_the_twin() {
     let Some(gpu) = device() else { return };
     for scene in scenes(256, 250, 3) {
         let compared = Compared::new(&gpu, &scene);
-        let (v, v_normal, _) = weights(&compared);
-        let slots = sums(&compared.view, &backward(&compared, &v, &v_normal));
+        let v = weights(&compared);
+        let slots = sums(&compared.view, &backward(&compared, &v));
         let v_disks: Vec<_> = slots.iter().map(|(sums, _)| from_numbers(*sums)).collect();
         let model = Gaussians64::from(&scene.model);
         let disks = project_disks(&model, &scene.camera, &scene.pose, 3, &RasterRules::HARD);
         let twin = project_disks_backward(&model, &scene.camera, &scene.pose, 3, &disks, &v_disks);
         let kernel = compared.view.parameter_gradients();
-        let mut seen = 0;
-        for (id, disk) in disks.iter().enumerate() {
-            let Some(disk) = disk else { continue };
-            seen += usize::from(v_disks[id].contribution > 0.0);
-            for (kind, from, to) in [
-                ("mean", 0, 3),
-                ("quaternion", 3, 7),
-                ("log scale", 7, 10),
-                ("opacity", 10, 11),
-                ("colour", 11, 59),
-            ] {
-                let length =
-                    |of: &dyn Fn(usize) -> f64| (from..to).map(|p| of(p).powi(2)).sum::<f64>().sqrt();
-                let difference = length(&|p| kernel.parameter(id, p) - twin.parameter(id, p));
-                // Sums that cancel, by the longer axis: the largest of what they are made of.
-                let g = v_disks[id];
-                let longest = disk.axes.map(|axis| axis.length());
-                let steep = longest[0] * longest[1];
-                let parts = match kind {
-                    "mean" => {
-                        steep * g.tau.abs()
-                            + longest[0] * g.uv[0].abs()
-                            + longest[1] * g.uv[1].abs()
-                            + 100.0 * (g.centre2d[0].abs() + g.centre2d[1].abs())
-                            + g.range.abs()
-                            + g.rgb.iter().map(|v| v.abs()).sum::<f64>()
-                    }
-                    "quaternion" | "log scale" => {
-                        let ratio = (longest[0] / longest[1]).max(longest[1] / longest[0]);
-                        ratio * g.products.iter().map(|v| v.abs()).sum::<f64>()
-                            + longest[0].max(longest[1]) * (g.tau_uv[0].abs() + g.tau_uv[1].abs())
-                            + g.normal[0].abs()
-                            + g.normal[1].abs()
-                    }
-                    _ => 0.0,
-                };
-                let tolerance = 1e-4 * (length(&|p| twin.parameter(id, p)) + parts) + 1e-9;
-                assert!(
-                    difference <= tolerance,
-                    "{}: {kind} of disk {id}: difference {difference:e}, tolerance {tolerance:e}",
-                    scene.name
-                );
-            }
-            assert_eq!(kernel.log_scales[id][2], 0.0, "a disk has no third scale");
-        }
+        let seen = assert_parameters(&scene.name, &kernel, &twin, &disks, &v_disks);
         assert!(seen > 20, "{}: {seen} disks are seen", scene.name);
     }
 }
@@ -425,7 +456,7 @@ fn normal_consistency_matches_the_twin() {
                 ..Raster::default()
             };
             let normal = normals.iter().map(|n| [n[0], n[1], n[2]].map(f64::from)).collect();
-            let picture = DiskRaster { raster, normal };
+            let picture = DiskRaster { raster, normal, ..DiskRaster::default() };
             let rays = pinhole_rays(&scene.camera);
             let twin = normal_consistency(&picture, &rays, weight.into(), LEAST_ALPHA.into());
             let kernel: Vec<[f32; 4]> = gpu.read(maps.buffers().v_normal, 0, pixels).unwrap();

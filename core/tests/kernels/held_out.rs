@@ -68,6 +68,7 @@ fn previews_show_all_that_the_run_sees_and_change_no_byte() {
         focus: focus.clone(),
         context: context.clone(),
         medium: Some(medium.clone()),
+        surface: None,
         ..run(&photographs, config(30))
     };
     let mut plain = Trainer::new(Arc::clone(&gpu), new()).unwrap();

@@ -28,6 +28,7 @@ fn trained(gpu: &Arc<Gpu>, config: &TrainConfig, views: &InMemory, medium: Optio
         context: Gaussians::empty(1),
         surfaces: Gaussians::empty(1),
         medium,
+        surface: None,
     };
     let mut trainer = Trainer::new(Arc::clone(gpu), run).unwrap();
     trainer.advance(config.iterations).unwrap();

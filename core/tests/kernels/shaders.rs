@@ -4,8 +4,8 @@ use std::mem::offset_of;
 
 use fathom_core::gpu::{
     BlockUniform, DbdrState, DbdrUniform, ExposureUniform, FilmUniform, FrameUniform, LossUniform,
-    MediumUniform, NormalsUniform, PriorsUniform, StepUniform, TileLayout, WaterState, WaterUniform,
-    shader_source,
+    MaskLossUniform, MediumUniform, NormalsUniform, PriorsUniform, StepUniform, SurfaceState,
+    SurfaceStepUniform, SurfaceUniform, TileLayout, WaterState, WaterUniform, shader_source,
 };
 
 /// Asserts that struct `name` of `stage` has the size and the offsets of its mirror.
@@ -77,7 +77,7 @@ fn uniforms_of_the_host_have_the_layout_of_the_shaders() {
         mean_noise,
         overwhite_weight,
         floater_weight,
-        pad,
+        mask_lr,
         seed,
         gradients_only,
         trainable,
@@ -99,6 +99,24 @@ fn uniforms_of_the_host_have_the_layout_of_the_shaders() {
         view_unbias2,
     );
     mirror!("normal_consistency", "Normals", NormalsUniform, weight, least_alpha, pad_a, pad_b);
+    mirror!("surface_rays", "Surface", SurfaceUniform, normal, offset, eta, schlick, as_shown, margin,);
+    mirror!(
+        "surface_step",
+        "SurfaceStep",
+        SurfaceStepUniform,
+        rows,
+        offset_rate,
+        tilt_rate,
+        unbias1,
+        unbias2,
+        pad,
+        pad1,
+        pad2,
+        pivot,
+        pad3,
+    );
+    mirror!("surface_step", "SurfaceState", SurfaceState, moment1, moment2, left_out, pad0, pad1, pad2,);
+    mirror!("surface_mask", "MaskLoss", MaskLossUniform, cells, first, weight,);
     mirror!("expose", "Exposure", ExposureUniform, pixels, view, views, pad0, rate, unbias1, unbias2, pad1,);
     mirror!(
         "water",

@@ -125,6 +125,7 @@ pub fn run(photographs: &InMemory, config: TrainConfig) -> TrainRun {
         context: Gaussians::empty(1),
         surfaces: Gaussians::empty(1),
         medium: None,
+        surface: None,
     }
 }
 

@@ -280,6 +280,7 @@ impl View {
                 v_range: &v_range,
                 slot_gradients: &slots,
                 disks: None,
+                traced: None,
                 step: &step,
                 appearances: &[],
             },

@@ -143,6 +143,7 @@ fn iteration(gpu: &Arc<Gpu>, recorder: fn(&Gpu) -> Recorder<'_>) -> [Vec<u32>; 8
         v_range: &v_range,
         slot_gradients: &slot_gradients,
         disks: None,
+        traced: None,
         step: &step,
         appearances: &[],
     };

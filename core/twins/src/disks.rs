@@ -1,8 +1,8 @@
 //! 2D Gaussians: disks, evaluated where the ray of a pixel meets their plane (Huang et al. 2024, "2DGS").
 //!
-//! A disk has a centre, two axes t_u, t_v of unit length and two scales. Its third scale is not used. Let m
-//! be the centre and o + t d the ray, both in the camera's frame. With a_u = t_u / s_u, a_v = t_v / s_v and
-//! N = a_u x a_v:
+//! A disk has a centre, two axes t_u, t_v of unit length and two scales. In place of a third scale it has the
+//! logit of its mask. Let m be the centre and o + t d the ray, both in the camera's frame. With
+//! a_u = t_u / s_u, a_v = t_v / s_v and N = a_u x a_v:
 //!
 //! ```text
 //! t = N.(m - o) / (N.d),   p = o + t d - m,   u = a_u.p,   v = a_v.p
@@ -10,9 +10,9 @@
 //! range = t |d|, or |m| where the second term decides
 //! ```
 //!
-//! Blending is that of `rasterize_forward`; normals are blended as colours are. A ray that meets the plane
-//! nearer than NEAR, or not at all, sees only the second term. Disks are sorted by the depth of their
-//! centres.
+//! Blending is that of `rasterize_forward`; normals and masks are blended as colours are. A ray that meets
+//! the plane nearer than NEAR, or not at all, sees only the second term. Disks are sorted by the depth of
+//! their centres.
 //!
 //! Which tiles a disk touches follows from its exact outline. The points m + r (s_u cos t_u + s_v sin t_v)
 //! project to an ellipse as long as all of them lie in front of the camera. [`Disk::bound`] has it, widened
@@ -24,7 +24,7 @@ use glam::{DMat3, DVec2, DVec3};
 use super::project_backward::quat_backward;
 use super::project_forward::{active_coeffs, norm, rotation_matrix, sigmoid};
 use super::{
-    Gaussians64, NEAR, Raster, RasterGradients, RasterRules, Splat, TILE, TileLists, sh_colour,
+    Gaussians64, NEAR, Raster, RasterGradients, RasterRules, Sight, Splat, TILE, TileLists, sh_colour,
     sh_colour_backward,
 };
 use fathom_core::scene::{PinholeCamera, Pose};
@@ -36,6 +36,13 @@ pub struct DiskRay {
     pub origin: DVec3,
     /// Where it goes; of any length.
     pub direction: DVec3,
+    /// Parameter from which on it meets disks; infinite for a pixel without a ray.
+    pub nearest: f64,
+}
+
+impl DiskRay {
+    /// For a pixel without a ray: it shows the background.
+    pub const NONE: Self = Self { origin: DVec3::ZERO, direction: DVec3::Z, nearest: f64::INFINITY };
 }
 
 /// The rays of the pixels of a camera, row-major.
@@ -43,7 +50,7 @@ pub fn pinhole_rays(camera: &PinholeCamera) -> Vec<DiskRay> {
     let ray = |i: u32| {
         let (x, y) = (f64::from(i % camera.width) + 0.5, f64::from(i / camera.width) + 0.5);
         let direction = DVec3::new((x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, 1.0);
-        DiskRay { origin: DVec3::ZERO, direction }
+        DiskRay { origin: DVec3::ZERO, direction, nearest: NEAR }
     };
     (0..camera.width * camera.height).map(ray).collect()
 }
@@ -59,6 +66,8 @@ pub struct Disk {
     pub normal: DVec3,
     /// The projected centre, pixels from the top-left corner.
     pub centre2d: [f64; 2],
+    /// 1 for a disk of the scene above a water surface, blended as a colour is.
+    pub mask: f64,
     /// An ellipse that holds all pixels whose alpha reaches `min_alpha`, for `intersect`. It also has the
     /// colour, the opacity, the range of the centre and the depth.
     pub bound: Splat,
@@ -72,7 +81,18 @@ pub fn project_disks(
     sh_degree: u8,
     rules: &RasterRules,
 ) -> Vec<Option<Disk>> {
-    (0..model.len()).map(|index| project(model, index, camera, pose, sh_degree, rules)).collect()
+    project_seen(model, camera, &Sight::straight(pose), sh_degree, rules)
+}
+
+/// The same for disks that are seen straight, mirrored or refracted.
+pub fn project_seen(
+    model: &Gaussians64,
+    camera: &PinholeCamera,
+    sight: &Sight,
+    sh_degree: u8,
+    rules: &RasterRules,
+) -> Vec<Option<Disk>> {
+    (0..model.len()).map(|index| project(model, index, camera, sight, sh_degree, rules)).collect()
 }
 
 /// The bounds, as `intersect` takes them.
@@ -84,46 +104,53 @@ fn project(
     model: &Gaussians64,
     index: usize,
     camera: &PinholeCamera,
-    pose: &Pose,
+    sight: &Sight,
     sh_degree: u8,
     rules: &RasterRules,
 ) -> Option<Disk> {
     let finite = model.means[index].iter().all(|v| v.is_finite())
         && model.quats[index].iter().all(|v| v.is_finite())
-        && model.log_scales[index][..2].iter().all(|v| v.is_finite())
+        && model.log_scales[index].iter().all(|v| v.is_finite())
         && model.opacity_logits[index].is_finite();
     let quat_norm = norm(model.quats[index]);
     let opacity = sigmoid(model.opacity_logits[index]);
-    let m = pose.transform(model.means[index].into());
+    let m = sight.transform(model.means[index].into());
+    let seen = sight.apparent(m)?;
     if !(finite
         && quat_norm > 0.0
         && quat_norm.is_finite()
-        && m.z > NEAR
+        && seen.z > NEAR
+        && sight.reaches(model.means[index].into())
         && opacity > 0.0
         && opacity >= rules.min_alpha)
     {
         return None;
     }
     let scales = [0, 1].map(|k| model.log_scales[index][k].exp());
-    let turned = DMat3::from_quat(pose.rotation) * rotation_matrix(model.quats[index]);
+    let turned = sight.world_to_camera * rotation_matrix(model.quats[index]);
     let axes = [turned.x_axis / scales[0], turned.y_axis / scales[1]];
-    let facing = turned.z_axis.dot(m);
-    let centre2d = [camera.fx * m.x / m.z + camera.cx, camera.fy * m.y / m.z + camera.cy];
-    let direction = (DVec3::from(model.means[index]) - pose.centre()).normalize();
+    let line = m - sight.start(m);
+    let facing = turned.z_axis.dot(line);
+    let centre2d = [camera.fx * seen.x / seen.z + camera.cx, camera.fy * seen.y / seen.z + camera.cy];
+    let direction = (sight.world_to_camera.transpose() * line).normalize();
     let rgb = sh_colour(direction, active_coeffs(model, index, sh_degree));
     let extent = (opacity / rules.min_alpha).ln();
     let reach = (2.0 * extent).sqrt();
     let half = [0, 1].map(|k| turned.col(k) * scales[k]);
-    let (offset, [xx, xy, yy]) =
-        outline(m, half, reach, camera).unwrap_or_else(|| whole_image(camera, centre2d, reach));
+    let ellipse = if sight.is_bent() {
+        sight.ellipse(m, half, reach, camera).map(|cov| (DVec2::ZERO, cov))
+    } else {
+        outline(m, half, reach, camera)
+    };
+    let (offset, [xx, xy, yy]) = ellipse.unwrap_or_else(|| whole_image(camera, centre2d, reach));
     let determinant = xx * yy - xy * xy;
     let bound = Splat {
         mean2d: [centre2d[0] + offset.x, centre2d[1] + offset.y],
         conic: [yy / determinant, -xy / determinant, xx / determinant],
         rgb,
         opacity,
-        range: m.length(),
-        depth: m.z,
+        range: line.length(),
+        depth: sight.depth(m),
         extent,
         half_size: [(2.0 * extent * xx).sqrt(), (2.0 * extent * yy).sqrt()],
     };
@@ -136,6 +163,7 @@ fn project(
         axes,
         normal: if facing > 0.0 { -turned.z_axis } else { turned.z_axis },
         centre2d,
+        mask: sigmoid(model.log_scales[index][2]),
         bound,
     })
 }
@@ -192,6 +220,8 @@ pub struct DiskRaster {
     pub raster: Raster,
     /// Sum of alpha T normal, camera axes, `[H*W]`.
     pub normal: Vec<[f64; 3]>,
+    /// Sum of alpha T mask, `[H*W]`.
+    pub mask: Vec<f64>,
 }
 
 /// Gradient of the loss with respect to a [`DiskRaster`].
@@ -201,20 +231,30 @@ pub struct DiskRasterGradients {
     pub raster: RasterGradients,
     /// With respect to the normals, `[H*W]`.
     pub normal: Vec<[f64; 3]>,
+    /// With respect to the masks, `[H*W]`.
+    pub mask: Vec<f64>,
 }
 
 /// One disk at one pixel.
 #[derive(Clone, Copy, Debug)]
-struct Contribution {
+pub(super) struct Contribution {
     /// (u, v) and the parameter of the ray; `None` where the low-pass decides.
-    hit: Option<(f64, f64, f64)>,
+    pub hit: Option<(f64, f64, f64)>,
     falloff: f64,
-    alpha: f64,
+    pub alpha: f64,
     capped: bool,
     range: f64,
 }
 
-fn contribution(disk: &Disk, pixel: [f64; 2], ray: &DiskRay, rules: &RasterRules) -> Option<Contribution> {
+pub(super) fn contribution(
+    disk: &Disk,
+    pixel: [f64; 2],
+    ray: &DiskRay,
+    rules: &RasterRules,
+) -> Option<Contribution> {
+    if !ray.nearest.is_finite() {
+        return None;
+    }
     let [a_u, a_v] = disk.axes;
     let normal = a_u.cross(a_v);
     let t = normal.dot(disk.centre - ray.origin) / normal.dot(ray.direction);
@@ -222,7 +262,7 @@ fn contribution(disk: &Disk, pixel: [f64; 2], ray: &DiskRay, rules: &RasterRules
     let (u, v) = (a_u.dot(p), a_v.dot(p));
     let delta = DVec2::from(disk.centre2d) - DVec2::from(pixel);
     let (solid, thin) = (u * u + v * v, 2.0 * delta.length_squared());
-    let is_hit = t > NEAR && solid <= thin;
+    let is_hit = t > ray.nearest && solid <= thin;
     let falloff = (-0.5 * if is_hit { solid } else { thin }).exp();
     let full = disk.bound.opacity * falloff;
     let alpha = full.min(rules.max_alpha);
@@ -235,7 +275,7 @@ fn contribution(disk: &Disk, pixel: [f64; 2], ray: &DiskRay, rules: &RasterRules
     })
 }
 
-fn pixel_at(x: u32, y: u32) -> [f64; 2] {
+pub(super) fn pixel_at(x: u32, y: u32) -> [f64; 2] {
     [f64::from(x) + 0.5, f64::from(y) + 0.5]
 }
 
@@ -260,10 +300,11 @@ pub fn trace_forward(
             last: vec![0; pixels],
         },
         normal: vec![[0.0; 3]; pixels],
+        mask: vec![0.0; pixels],
     };
     for (pixel, ray) in rays.iter().enumerate() {
         let (x, y) = (pixel as u32 % width, pixel as u32 / width);
-        let (mut rgb, mut range, mut normal) = (DVec3::ZERO, 0.0, DVec3::ZERO);
+        let (mut rgb, mut range, mut normal, mut mask) = (DVec3::ZERO, 0.0, DVec3::ZERO, 0.0);
         let (mut transmittance, mut last) = (1.0, 0);
         for (&id, seen) in lists.of_tile(x / TILE, y / TILE).iter().zip(1..) {
             let Some(disk) = &disks[id as usize] else { continue };
@@ -276,6 +317,7 @@ pub fn trace_forward(
             rgb += weight * DVec3::from(disk.bound.rgb);
             range += weight * at.range;
             normal += weight * disk.normal;
+            mask += weight * disk.mask;
             transmittance = next;
             last = seen;
         }
@@ -286,6 +328,7 @@ pub fn trace_forward(
         raster.transmittance[pixel] = transmittance;
         raster.last[pixel] = last;
         out.normal[pixel] = normal.into();
+        out.mask[pixel] = mask;
     }
     out
 }
@@ -310,6 +353,8 @@ pub struct DiskGradient {
     pub normal: [f64; 2],
     /// With respect to the colour.
     pub rgb: [f64; 3],
+    /// With respect to the mask.
+    pub mask: f64,
     /// With respect to the opacity (after the sigmoid).
     pub opacity: f64,
     /// Sum of the absolute gradients with respect to the position on the image, x and y, per pixel; as
@@ -317,6 +362,15 @@ pub struct DiskGradient {
     pub abs: f64,
     /// Sum of alpha T. Not a gradient.
     pub contribution: f64,
+}
+
+/// Gradient of the loss with respect to a [`DiskRay`], where disks decide and not the low-pass.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct RayGradient {
+    /// With respect to where it begins.
+    pub origin: DVec3,
+    /// With respect to where it goes.
+    pub direction: DVec3,
 }
 
 /// Backward pass of [`trace_forward`]; see `rasterize_backward` for the gradient through alpha.
@@ -330,18 +384,36 @@ pub fn trace_backward(
     rules: &RasterRules,
     v: &DiskRasterGradients,
 ) -> Vec<DiskGradient> {
+    trace_backward_along(disks, lists, rays, camera, forward, background, rules, v).0
+}
+
+/// The same, and the gradients of the rays.
+pub fn trace_backward_along(
+    disks: &[Option<Disk>],
+    lists: &TileLists,
+    rays: &[DiskRay],
+    camera: &PinholeCamera,
+    forward: &DiskRaster,
+    background: [f64; 3],
+    rules: &RasterRules,
+    v: &DiskRasterGradients,
+) -> (Vec<DiskGradient>, Vec<RayGradient>) {
     let mut v_disks = vec![DiskGradient::default(); disks.len()];
+    let mut v_rays = vec![RayGradient::default(); rays.len()];
     let background = DVec3::from(background);
     for (pixel, ray) in rays.iter().enumerate() {
         let (x, y) = (pixel as u32 % camera.width, pixel as u32 / camera.width);
         let [v_rgb, v_normal] = [v.raster.rgb[pixel], v.normal[pixel]].map(DVec3::from);
-        let (v_alpha, v_range) = (v.raster.alpha[pixel], v.raster.range[pixel]);
+        let (v_alpha, v_range, v_mask) = (v.raster.alpha[pixel], v.raster.range[pixel], v.mask[pixel]);
         let behind_all = forward.raster.transmittance[pixel] * (background.dot(v_rgb) - v_alpha);
         let ids = &lists.of_tile(x / TILE, y / TILE)[..forward.raster.last[pixel] as usize];
         let seen = ids.iter().filter_map(|&id| {
             let disk = disks[id as usize].as_ref()?;
             let at = contribution(disk, pixel_at(x, y), ray, rules)?;
-            let value = v_rgb.dot(disk.bound.rgb.into()) + at.range * v_range + v_normal.dot(disk.normal);
+            let value = v_rgb.dot(disk.bound.rgb.into())
+                + at.range * v_range
+                + v_normal.dot(disk.normal)
+                + disk.mask * v_mask;
             Some((id as usize, disk, at, value))
         });
         let seen: Vec<_> = seen.collect();
@@ -365,10 +437,11 @@ pub fn trace_backward(
             };
             let sum = &mut v_disks[id];
             sum.contribution += weight;
-            add(sum, disk, &at, ray, pixel_at(x, y), camera, &v_pixel);
+            sum.mask += weight * v_mask;
+            add(sum, &mut v_rays[pixel], disk, &at, ray, pixel_at(x, y), camera, &v_pixel);
         }
     }
-    v_disks
+    (v_disks, v_rays)
 }
 
 /// Gradients at one pixel, of what a disk adds there.
@@ -382,6 +455,7 @@ struct PixelGradient {
 
 fn add(
     sum: &mut DiskGradient,
+    v_ray: &mut RayGradient,
     disk: &Disk,
     at: &Contribution,
     ray: &DiskRay,
@@ -409,9 +483,13 @@ fn add(
             }
             sum.tau_uv[0] += tau * u;
             sum.tau_uv[1] += tau * w;
+            let v_met = v_p - tau * a_u.cross(a_v);
+            v_ray.origin += v_met;
+            v_ray.direction += t * v_met + v.range * t / d.length() * d;
             // How sigma changes when the pixel moves over the plane.
             let slope = a_u.cross(a_v) * (v_p.dot(d) / steep);
-            t * (v_p - slope).truncate() / DVec2::new(camera.fx, camera.fy)
+            let depth = ray.origin.z + t * d.z;
+            depth * (v_p - slope).truncate() / DVec2::new(camera.fx, camera.fy)
         }
         None => {
             let v_centre = 2.0 * v.sigma * (DVec2::from(disk.centre2d) - DVec2::from(pixel));
@@ -424,8 +502,8 @@ fn add(
     sum.abs += on_image.x.abs() + on_image.y.abs();
 }
 
-/// Gradient of the model from the gradient of its disks, both by Gaussian; culled ones get zeros. The third
-/// scale has none.
+/// Gradient of the model from the gradient of its disks, both by Gaussian; culled ones get zeros. That of the
+/// third scale is the gradient of the logit of the mask.
 pub fn project_disks_backward(
     model: &Gaussians64,
     camera: &PinholeCamera,
@@ -434,8 +512,21 @@ pub fn project_disks_backward(
     disks: &[Option<Disk>],
     v_disks: &[DiskGradient],
 ) -> Gaussians64 {
+    project_seen_backward(model, camera, &Sight::straight(pose), sh_degree, disks, v_disks)
+}
+
+/// The same for disks that are seen straight, mirrored or refracted. Only in the first case they have ranges
+/// and normals with gradients.
+pub fn project_seen_backward(
+    model: &Gaussians64,
+    camera: &PinholeCamera,
+    sight: &Sight,
+    sh_degree: u8,
+    disks: &[Option<Disk>],
+    v_disks: &[DiskGradient],
+) -> Gaussians64 {
     let mut v_model = Gaussians64::zeros(model.len(), model.sh_degree);
-    let world_to_camera = DMat3::from_quat(pose.rotation);
+    let camera_to_world = sight.world_to_camera.transpose();
     for (index, (disk, v)) in disks.iter().zip(v_disks).enumerate() {
         let Some(disk) = disk else { continue };
         let [a_u, a_v] = disk.axes;
@@ -446,30 +537,34 @@ pub fn project_disks_backward(
         let v_normal = -(v.tau_uv[0] * half[0] + v.tau_uv[1] * half[1]);
         let v_u = v.products[0] * half[0] + v.products[1] * half[1] + a_v.cross(v_normal);
         let v_v = v.products[2] * half[0] + v.products[3] * half[1] + v_normal.cross(a_u);
-        v_model.log_scales[index] = [-v_u.dot(a_u), -v_v.dot(a_v), 0.0];
+        let v_mask = v.mask * disk.mask * (1.0 - disk.mask);
+        v_model.log_scales[index] = [-v_u.dot(a_u), -v_v.dot(a_v), v_mask];
 
         let unit = half.map(DVec3::normalize);
         let side = if disk.normal.dot(normal) < 0.0 { -1.0 } else { 1.0 };
         let v_facing = side * (v.normal[0] * unit[0] + v.normal[1] * unit[1]);
         let v_turned = DMat3::from_cols(v_u * a_u.length(), v_v * a_v.length(), v_facing);
-        v_model.quats[index] = quat_backward(model.quats[index], world_to_camera.transpose() * v_turned);
+        v_model.quats[index] = quat_backward(model.quats[index], camera_to_world * v_turned);
 
-        let inv_z = 1.0 / m.z;
-        let focal = DVec2::new(camera.fx, camera.fy);
-        let v_centre = DVec2::from(v.centre2d) * focal;
-        let mut v_m = v.tau * normal - v.uv[0] * a_u - v.uv[1] * a_v;
-        v_m += DVec3::new(v_centre.x, v_centre.y, -v_centre.dot(m.truncate()) * inv_z) * inv_z;
-        v_m += v.range / m.length() * m;
+        let seen = sight.apparent(m).unwrap_or(m);
+        let inv_z = 1.0 / seen.z;
+        let v_centre = DVec2::from(v.centre2d) * DVec2::new(camera.fx, camera.fy);
+        let v_seen = DVec3::new(v_centre.x, v_centre.y, -v_centre.dot(seen.truncate()) * inv_z) * inv_z;
+        let mut v_m = v.tau * normal - v.uv[0] * a_u - v.uv[1] * a_v + sight.pulled(m, v_seen);
+        if !sight.is_bent() {
+            v_m += v.range / m.length() * m;
+        }
 
-        let towards = DVec3::from(model.means[index]) - pose.centre();
-        let distance = towards.length();
-        let direction = towards / distance;
+        let line = m - sight.start(m);
+        let distance = line.length();
+        let direction = camera_to_world * line / distance;
         let coeffs = active_coeffs(model, index, sh_degree);
         let first = index * model.coeffs();
         let v_coeffs = &mut v_model.sh_coeffs[first..first + coeffs.len()];
         let v_direction = sh_colour_backward(direction, coeffs, v.rgb, v_coeffs);
-        let v_towards = (v_direction - direction * direction.dot(v_direction)) / distance;
-        v_model.means[index] = (world_to_camera.transpose() * v_m + v_towards).into();
+        let v_line = (v_direction - direction * direction.dot(v_direction)) / distance;
+        v_m += sight.offset_pulled(m, sight.world_to_camera * v_line);
+        v_model.means[index] = (camera_to_world * v_m).into();
         let opacity = disk.bound.opacity;
         v_model.opacity_logits[index] = v.opacity * opacity * (1.0 - opacity);
     }

@@ -33,6 +33,7 @@ mod rasterize_backward;
 mod rasterize_forward;
 pub mod samples;
 mod spherical_harmonics;
+mod surface;
 mod water;
 
 pub use adam::{
@@ -42,8 +43,9 @@ pub use adam::{
 pub use chain::{ViewGradients, ViewInput, render, view_gradients};
 pub use dbdr::{RefinementState, form_refined, form_refined_backward};
 pub use disks::{
-    Disk, DiskGradient, DiskRaster, DiskRasterGradients, DiskRay, bounds_of, pinhole_rays, project_disks,
-    project_disks_backward, trace_backward, trace_forward,
+    Disk, DiskGradient, DiskRaster, DiskRasterGradients, DiskRay, RayGradient, bounds_of, pinhole_rays,
+    project_disks, project_disks_backward, project_seen, project_seen_backward, trace_backward,
+    trace_backward_along, trace_forward,
 };
 pub use exposure::{Exposure, ExposureState, IDENTITY, expose, expose_backward};
 pub use film::{Embedding, FilmGradients, FilmPicture, FilmState, FilmWeights, UNITS, film, film_backward};
@@ -60,6 +62,10 @@ pub use project_forward::{Splat, project_forward};
 pub use rasterize_backward::{RasterGradients, SplatGradient, rasterize_backward};
 pub use rasterize_forward::{Raster, rasterize_forward};
 pub use spherical_harmonics::{sh_basis_gradient, sh_colour, sh_colour_backward};
+pub use surface::{
+    PictureGradients, Pictures, PlaneState, RayGradients, Sight, SurfaceRays, WaterSurface, compose,
+    compose_backward, mask_loss, plane_gradients, refracted_outline, surface_rays, trace_per_hit,
+};
 pub use water::{
     Blended, MAX_COLOUR_LR_SCALE, WaterState, decode, encode, form, form_backward, in_water,
     in_water_backward, lr_scale_under_water,

@@ -98,7 +98,7 @@ mod tests {
         let range = pixels.clone().map(|i| alpha[i as usize] * (2.0 + 0.3 * u(i, 1))).collect();
         let normal = pixels.map(|i| [u(i, 2) - 0.5, u(i, 3) - 0.5, -u(i, 4)]).collect();
         let raster = Raster { width: WIDTH, height: HEIGHT, alpha, range, ..Raster::default() };
-        (DiskRaster { raster, normal }, off_centre_view(WIDTH, HEIGHT, 3.0).0)
+        (DiskRaster { raster, normal, ..DiskRaster::default() }, off_centre_view(WIDTH, HEIGHT, 3.0).0)
     }
 
     #[test]
@@ -144,7 +144,7 @@ mod tests {
             range: rays.iter().map(range).collect(),
             ..Raster::default()
         };
-        let picture = DiskRaster { raster, normal: vec![normal.into(); rays.len()] };
+        let picture = DiskRaster { raster, normal: vec![normal.into(); rays.len()], ..DiskRaster::default() };
         let found = normal_consistency(&picture, &rays, 1.0, 0.5);
         assert!(found.loss.abs() < 1e-9, "{}", found.loss);
         assert!(found.v_range.iter().all(|v| v.abs() < 1e-6));

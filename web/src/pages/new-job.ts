@@ -25,6 +25,7 @@ const PRESETS = [
     ['paper', 'paper: SMP-UWGS as printed'],
     ['3dgs', '3dgs: plain 3D Gaussian splatting, no water'],
     ['2dgs', '2dgs: disks on surfaces, no water'],
+    ['wsgs', 'wsgs: seen through a water surface'],
 ] as const;
 const LOST = 'The service does not answer. Press the button again: there will be one job only.';
 const REUSED = 'This form has already created a job with other values. Look for it in the list of jobs. For a second job, open this form again.';

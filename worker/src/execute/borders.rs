@@ -51,7 +51,8 @@ pub fn run(
     let config = task.config.borders.of_run(config);
     tracing::info!(gaussians = band.len(), views = views.views().len(), "training the borders");
     let (extent, surfaces) = (task.common.scene_extent, Gaussians::empty(config.sh_degree));
-    let run = TrainRun { config: config.clone(), extent, views, focus, context, surfaces, medium };
+    let run =
+        TrainRun { config: config.clone(), extent, views, focus, context, surfaces, medium, surface: None };
     let mut trainer = open(gpu, task, run)?;
     let span = Span::of(&task.common);
     let resumed_from = span.done(trainer.progress().iteration);

@@ -8,7 +8,7 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 use fathom_core::cover::{CoverMeter, HeldOut};
-use fathom_core::gpu::{Gpu, Output, Rendered, Renderer, SeamRun, WaterView};
+use fathom_core::gpu::{Gpu, Output, Rendered, Renderer, SeamRun, SurfaceRenderer, WaterView};
 use fathom_core::metrics::{SsimMap, psnr, quantised};
 use fathom_core::picture::{encode_png, prepared_camera};
 use fathom_core::ply;
@@ -52,6 +52,10 @@ pub fn run(
     let through = |output| record.as_ref().map(|record| WaterView::of_record(record, output));
     let drawing = ply::drawing(path)?;
     let mut renderer = Renderer::new(Arc::clone(gpu), &model)?.drawn(drawing)?;
+    let mut through_surface = match ply::read_surface_model(path)? {
+        Some(model) => Some(SurfaceRenderer::new(Arc::clone(gpu), &model)?),
+        None => None,
+    };
     let mut seams = match &spec.seams {
         Some(lines) => {
             let measured = (seam_lines(lines)?, task.config.seams.clone());
@@ -83,9 +87,16 @@ pub fn run(
             Ok(renderer.render(&view.camera, &view.pose, BACKGROUND)?)
         };
         let picture = |shown: &Rendered| quantised(shown.width, shown.height, &shown.rgb);
-        let seen = shown(Output::Underwater)?;
-        let render = picture(&seen);
         let (mut parts, mut clear) = (Vec::new(), None);
+        let seen = match &mut through_surface {
+            Some(renderer) => renderer.render(&view.camera, &view.pose)?,
+            None => shown(Output::Underwater)?,
+        };
+        if through_surface.is_some() {
+            // The scene without the surface.
+            parts.push(picture(&shown(Output::Underwater)?));
+        }
+        let render = picture(&seen);
         if let Some(gains) = gains {
             let mut rendered = shown(Output::Restored)?;
             clear = Some(picture(&rendered));

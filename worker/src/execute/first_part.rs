@@ -228,6 +228,7 @@ fn first_run(task: &TaskInput, own: &OwnPart) -> Result<TrainRun, TaskError> {
         context: parts.context.clone(),
         surfaces: parts.surfaces.clone(),
         medium,
+        surface: None,
     })
 }
 

@@ -88,7 +88,7 @@ pub fn own_part(
         }
     };
     let views = under_water(task, medium.as_ref(), views)?;
-    let parts = Parts { focus, context, surfaces, shared, medium, water };
+    let parts = Parts { focus, context, surfaces, shared, medium, water, surface: None };
     if parts.focus.is_empty() {
         tracing::warn!(shared = parts.shared.len(), "this partition has nothing to train");
         return Ok(Some(OwnPart { parts, views, config }));

@@ -11,6 +11,8 @@ use fathom_core::gpu::{Gpu, spatial_order};
 use fathom_core::method::{self, Run};
 use fathom_core::ply;
 use fathom_core::scene::Points;
+use fathom_core::surface::SurfaceModel;
+use fathom_core::train::surface::{SurfaceRun, surface_run};
 use fathom_core::train::{
     HeldOutMetrics, MediumRun, StartingWater, TrainRun, Trainer, initial_gaussians, starting_water,
     surface_points, with_ray_maps,
@@ -61,6 +63,11 @@ pub fn parts_of_points(
 ) -> Result<(Parts, Arc<dyn ViewSource>), TaskError> {
     let views = &views;
     let (points, config) = (read_points(task)?, task.train_config());
+    if task.config.method.through_surface() {
+        let focus = initial_gaussians(&points, views.views(), &config, None)?;
+        let surface = surface_run(&points, views.views(), &task.common.views, &config, &task.config.surface)?;
+        return Ok((Parts { surface: Some(surface), ..Parts::only(focus) }, Arc::clone(views)));
+    }
     let full = task.full_views(views)?;
     let start = starting_water(&task.config.water, task.unit(), &points, full.as_ref(), &task.common.views)?;
     let Some(StartingWater { medium, points }) = start else {
@@ -88,13 +95,23 @@ pub struct Parts {
     pub medium: Option<MediumRun>,
     /// The shared water as recorded in the coarse model.
     pub water: Option<WaterRecord>,
+    /// The water surface that cameras look through.
+    pub surface: Option<SurfaceRun>,
 }
 
 impl Parts {
     /// A run that trains everything.
     pub fn only(focus: Gaussians) -> Self {
         let none = Gaussians::empty(focus.sh_degree);
-        Self { focus, context: none.clone(), surfaces: none.clone(), shared: none, medium: None, water: None }
+        Self {
+            focus,
+            context: none.clone(),
+            surfaces: none.clone(),
+            shared: none,
+            medium: None,
+            water: None,
+            surface: None,
+        }
     }
 }
 
@@ -135,12 +152,12 @@ pub fn train(
     task: &TaskInput,
     config: TrainConfig,
     views: Arc<dyn ViewSource>,
-    Parts { focus, context, surfaces, shared, medium, water }: Parts,
+    Parts { focus, context, surfaces, shared, medium, water, surface }: Parts,
     span: Span,
     control: &dyn Control,
 ) -> Result<TaskOutput, TaskError> {
     let extent = task.common.scene_extent;
-    let run = TrainRun { config: config.clone(), extent, views, focus, context, surfaces, medium };
+    let run = TrainRun { config: config.clone(), extent, views, focus, context, surfaces, medium, surface };
     let mut run = method::start(task.config.method, Arc::clone(gpu), run)?;
     go_on(task, run.as_mut())?;
     let resumed_from = span.done(run.progress().iteration);
@@ -164,11 +181,30 @@ pub fn finish(
     if trained.skipped_steps > 0 {
         tracing::warn!(
             skipped = trained.skipped_steps,
-            "steps of the water were skipped: their gradients were not finite"
+            "steps of the water, or of its surface, were skipped: their gradients were not finite"
         );
+    }
+    if let Some(model) = &trained.surface {
+        let model = in_order(model);
+        let result = Bytes::from(ply::surface_to_bytes(&model, &[])?);
+        let gaussians = model.len() as u32;
+        return Ok(TaskOutput { result, gaussians, resumed_from, held_out: history, further: Vec::new() });
     }
     let water = water.or(trained.water);
     output_of(&trained.gaussians, config, water.as_ref(), resumed_from, history)
+}
+
+/// A scene with a water surface whose sets are sorted as `output_of` sorts.
+fn in_order(model: &SurfaceModel) -> SurfaceModel {
+    let sorted = |set: &Gaussians| set.in_order(&spatial_order(set));
+    let order = spatial_order(&model.straight);
+    SurfaceModel {
+        straight: model.straight.in_order(&order),
+        masks: order.iter().map(|&index| model.masks[index as usize]).collect(),
+        reflected: sorted(&model.reflected),
+        refracted: sorted(&model.refracted),
+        record: model.record.clone(),
+    }
 }
 
 /// The checkpoint of an earlier attempt; `None` if none can be read.

@@ -44,7 +44,9 @@ impl Trainer {
         self.by_block(&sources, |block, _, rows| {
             let buffer = self.gpu.buffer("densify rows", rows.len() as u64 * 8)?;
             self.gpu.write(&buffer, 0, rows);
-            let count = self.gpu.uniform("densify", &[rows.len() as u32, 0, 0, 0]);
+            // The third number of a disk is not a scale.
+            let axes = if self.config.disks { 2 } else { 3 };
+            let count = self.gpu.uniform("densify", &[rows.len() as u32, axes, 0, 0]);
             recorder.dispatch(
                 "densify_split",
                 Size::Items(rows.len() as u32, 64),

@@ -12,7 +12,7 @@ use bytemuck::{Pod, Zeroable};
 
 use super::Trainer;
 use crate::config::Strategy;
-use crate::gpu::{Block, BlockTraining, Recorder, Size, block_capacity, sh_stride};
+use crate::gpu::{Block, BlockTraining, Recorder, Size, SurfaceRays, block_capacity, sh_stride};
 use crate::{CoreError, Result};
 
 /// Largest number of Gaussians split or moved between two submissions: bounds the staging buffer.
@@ -74,20 +74,28 @@ impl Trainer {
             let buffer =
                 self.gpu.buffer("density stats", u64::from(block.count) * size_of::<Stats>() as u64)?;
             let mut recorder = Recorder::new(&self.gpu);
-            recorder.dispatch(
-                "density_stats",
-                Size::Items(block.count, 64),
-                &[
-                    ("block", &block.uniform),
-                    ("transforms", &block.transforms),
-                    ("density_sums", &training.density_sums),
-                    ("stats", &buffer),
-                ],
-            )?;
+            let mut bound = vec![
+                ("block", &block.uniform),
+                ("transforms", &block.transforms),
+                ("density_sums", &training.density_sums),
+                ("stats", &buffer),
+            ];
+            bound.extend(self.frame.bound_surface());
+            recorder.dispatch(self.stats_kernel(), Size::Items(block.count, 64), &bound)?;
             recorder.submit();
             stats.extend(self.gpu.read::<Stats>(&buffer, 0, block.count as usize)?);
         }
         Ok(stats)
+    }
+
+    fn stats_kernel(&self) -> &'static str {
+        match (self.config.disks, self.frame.rays()) {
+            (false, _) => "density_stats",
+            (true, None) if self.masked => "density_stats_masked",
+            (true, None) => "density_stats_disks",
+            (true, Some(SurfaceRays::Reflected)) => "density_stats_above",
+            (true, Some(SurfaceRays::Refracted)) => "density_stats_below",
+        }
     }
 
     /// A staging buffer for `count` Gaussians: transforms and coefficients.

@@ -20,7 +20,8 @@ fn a_task_makes_the_previews_of_its_spec_when_they_are_due() {
     let views = input.views(MIB).unwrap();
     let (Parts { focus, context, surfaces, medium, .. }, views) = parts_of_points(&input, views).unwrap();
     let extent = input.common.scene_extent;
-    let run = TrainRun { config: config.clone(), extent, views, focus, context, surfaces, medium };
+    let run =
+        TrainRun { config: config.clone(), extent, views, focus, context, surfaces, medium, surface: None };
     let mut run = method::start(input.config.method, gpu, run).unwrap();
     run.advance(5).unwrap();
 

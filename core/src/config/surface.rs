@@ -1,0 +1,160 @@
+//! Scenes seen through a water surface (WSGS, "Through the Water: Refractive Gaussian Splatting").
+
+use serde::{Deserialize, Serialize};
+
+/// What of the water surface is trained.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum SurfaceRefine {
+    /// Nothing: the plane stays where the sparse points or the configuration put it.
+    #[default]
+    Fixed,
+    /// The offset, as in the paper.
+    Offset,
+    /// The offset and the tilt of the normal.
+    Tilt,
+}
+
+/// How much of the light the surface reflects.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Reflectance {
+    /// Fresnel's equations for unpolarised light.
+    #[default]
+    Fresnel,
+    /// Schlick's approximation (WSGS eq. 10): 0.05 off at 80 degrees.
+    Schlick,
+}
+
+/// In which encoding reflected and refracted light add.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum SurfaceLight {
+    /// In linear light.
+    #[default]
+    Linear,
+    /// In sRGB, as the paper prints it.
+    Srgb,
+}
+
+/// Where the water surface comes from.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum SurfaceStart {
+    /// From the sparse points: straight against refracted triangulation.
+    #[default]
+    Tracks,
+    /// Half-way between the worst points and the lowest camera (WSGS section 4.1).
+    Paper,
+}
+
+/// A scene seen through a calm water surface; used by method `wsgs`. Shares are those of the run.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct SurfaceConfig {
+    /// Normal of the surface towards the air, scene axes. Default: from the sparse points.
+    pub normal: Option<[f64; 3]>,
+    /// Offset of the surface along its normal, scene units. Default: from the sparse points.
+    pub offset: Option<f64>,
+    /// Refractive index of the water. Default 1.333.
+    pub ior: f64,
+    /// Where the surface comes from: `tracks` or `paper`. Default `tracks`.
+    pub start: SurfaceStart,
+    /// What of the surface is trained: `fixed`, `offset` or `tilt`. Default `fixed`: the estimate from the
+    /// sparse points is nearer to the truth.
+    pub refine: SurfaceRefine,
+    /// How much light the surface reflects: `fresnel` or `schlick`. Default `fresnel`.
+    pub reflectance: Reflectance,
+    /// How reflected and refracted light add: `linear` or `srgb`. Default `linear`.
+    pub light: SurfaceLight,
+    /// Share of the run before which only the scene above water is trained. Default 18/70 (WSGS).
+    pub from: f32,
+    /// Shares of the cap: scene above water, refracted set, reflected set. Default 0.6, 0.25, 0.15.
+    pub shares: [f32; 3],
+    /// Weight of the loss between mask and pseudo-mask (WSGS eq. 15). Default 0.5; the paper has 0.05, in
+    /// runs that are twenty times as long.
+    pub mask_weight: f32,
+    /// Share of the run from which that loss counts. Default 18/70; the paper has 30/70.
+    pub mask_from: f32,
+    /// Times that pseudo-masks are made, evenly spread from `from` to `reset_until`. Default 8.
+    pub pseudo_masks: u32,
+    /// Learning rate of the masks. Default 0.05; the paper has 0.01.
+    pub mask_lr: f32,
+    /// Share of the run between two resets of the masks of disks below the surface. Default 1/70 (WSGS). 0
+    /// disables them.
+    pub reset_every: f32,
+    /// Depth from which on such a disk is reset, times [`crate::scene::learning_scale`]. Default 0.
+    pub reset_margin: f32,
+    /// Share of the run after which masks are not reset. Default 0.79 (WSGS).
+    pub reset_until: f32,
+    /// Learning rate of the offset, times [`crate::scene::learning_scale`]. Default 1e-3 (WSGS).
+    pub offset_lr: f32,
+    /// Learning rate of the tilt, radians. Default 1e-4.
+    pub tilt_lr: f32,
+    /// Share of the run after which the surface stays. Default 30/70 (WSGS).
+    pub refine_until: f32,
+}
+
+impl SurfaceConfig {
+    /// Reports every fault.
+    pub(super) fn validate(&self, require: &mut impl FnMut(bool, &str)) {
+        let share = |value: f32| (0.0..=1.0).contains(&value);
+        require(
+            self.ior.is_finite() && self.ior > crate::surface::AIR,
+            "surface.ior must be above that of air, 1.000293; water has 1.333",
+        );
+        require(
+            self.normal.is_none_or(|normal| glam::DVec3::from(normal).length() > 1e-6),
+            "surface.normal must be a direction: three numbers that are not all 0",
+        );
+        require(self.offset.is_none_or(f64::is_finite), "surface.offset must be a number");
+        require(
+            self.offset.is_none() || self.normal.is_some(),
+            "surface.offset needs surface.normal: it is the distance along it",
+        );
+        require(
+            self.shares.iter().all(|share| *share > 0.0 && share.is_finite()),
+            "surface.shares must be three numbers above 0",
+        );
+        require(
+            self.from < 1.0
+                && [self.from, self.mask_from, self.reset_every, self.reset_until, self.refine_until]
+                    .into_iter()
+                    .all(share),
+            "surface.from, mask_from, reset_every, reset_until and refine_until must be shares of the run, and \
+             surface.from below 1",
+        );
+        require(
+            [self.mask_weight, self.mask_lr, self.offset_lr, self.tilt_lr, self.reset_margin]
+                .into_iter()
+                .all(|value| value.is_finite() && value >= 0.0),
+            "surface.mask_weight, mask_lr, offset_lr, tilt_lr and reset_margin must not be negative",
+        );
+    }
+}
+
+impl Default for SurfaceConfig {
+    fn default() -> Self {
+        Self {
+            normal: None,
+            offset: None,
+            ior: crate::surface::WATER,
+            start: SurfaceStart::Tracks,
+            refine: SurfaceRefine::Fixed,
+            reflectance: Reflectance::Fresnel,
+            light: SurfaceLight::Linear,
+            from: 18.0 / 70.0,
+            shares: [0.6, 0.25, 0.15],
+            mask_weight: 0.5,
+            mask_from: 18.0 / 70.0,
+            pseudo_masks: 8,
+            mask_lr: 0.05,
+            reset_every: 1.0 / 70.0,
+            reset_margin: 0.0,
+            reset_until: 0.79,
+            offset_lr: 1e-3,
+            tilt_lr: 1e-4,
+            refine_until: 30.0 / 70.0,
+        }
+    }
+}

@@ -1,0 +1,169 @@
+//! The starts of the sets of a scene with a water surface.
+
+use glam::DVec3;
+
+use super::SurfaceRun;
+use crate::Result;
+use crate::config::{SurfaceConfig, SurfaceStart, TrainConfig};
+use crate::gaussians::{Gaussians, SH_C0};
+use crate::rng::{Stream, random_bits, uniform};
+use crate::scene::Points;
+use crate::surface::{Surface, SurfaceOptions, SurfaceRecord, SurfaceSource, surface_prior};
+use crate::train::init::{gaussians_from_points, limit, turn};
+use crate::views::TrainView;
+
+/// Opacity of a new disk of the refracted and the reflected set. The paper has 0.1; see
+/// `train::init::OPACITY`.
+const OPACITY: f32 = 0.5;
+/// Colour of a new disk of the reflected set, sRGB: dark, but with a gradient.
+const DARK: f32 = 0.2;
+/// Radius of the dome on which the reflected set starts, in mean distances of the cameras from the surface.
+const NEAREST_DOME: f64 = 1.0;
+const FARTHEST_DOME: f64 = 2.5;
+/// The water surface of a run, found or given, and the starts of the sets that it shows.
+///
+/// `views` are the training views, and `scene_views` their numbers in the tracks of `points`.
+///
+/// # Errors
+/// When the surface is not given and cannot be found, or lies above a camera
+/// ([`crate::surface::SurfaceError`]).
+pub fn surface_run(
+    points: &Points,
+    views: &[TrainView],
+    scene_views: &[u32],
+    train: &TrainConfig,
+    config: &SurfaceConfig,
+) -> Result<SurfaceRun> {
+    let options = SurfaceOptions {
+        offset: config.offset,
+        normal: config.normal.map(DVec3::from),
+        ior: config.ior,
+        up: None,
+        start: match config.start {
+            SurfaceStart::Tracks => crate::surface::SurfaceStart::Tracks,
+            SurfaceStart::Paper => crate::surface::SurfaceStart::Paper,
+        },
+    };
+    let cameras: Vec<_> = views.iter().map(|view| (view.camera, view.pose)).collect();
+    let prior = surface_prior(points, &cameras, scene_views, &options)?;
+    let surface = prior.surface;
+    tracing::info!(
+        normal = ?surface.normal.to_array(),
+        offset = surface.offset,
+        standard_error = ?prior.standard_error,
+        wet = prior.wet.len(),
+        dry = prior.dry.len(),
+        "found the water surface"
+    );
+    let given = config.normal.is_some() && config.offset.is_some();
+    let record = SurfaceRecord {
+        reflectance: config.reflectance,
+        light: config.light,
+        source: match config.start {
+            _ if given => SurfaceSource::Given,
+            SurfaceStart::Tracks => SurfaceSource::Tracks,
+            SurfaceStart::Paper => SurfaceSource::Paper,
+        },
+        offset_error: prior.standard_error.map(|error| error.offset),
+        tilt_error_degrees: prior.standard_error.map(|error| error.tilt_degrees),
+        ..SurfaceRecord::given(&surface)
+    };
+    let eyes: Vec<DVec3> = views.iter().map(|view| view.pose.centre()).collect();
+    let [_, refracted, reflected] = super::caps(train.max_gaussians, config.shares);
+    let wet = prior.wet_points();
+    let refracted = if wet.is_empty() {
+        sunken_start(points, &eyes, &surface, train, refracted)?
+    } else {
+        refracted_start(&wet, train, refracted)?
+    };
+    Ok(SurfaceRun {
+        record,
+        pivot: prior.centre,
+        reflected: dome_start(prior.centre, &eyes, &surface, train, reflected)?,
+        refracted,
+        config: config.clone(),
+    })
+}
+
+/// The start of the refracted set: disks at the points in the water, where refraction puts them.
+///
+/// # Errors
+/// When there are no points.
+fn refracted_start(points: &Points, config: &TrainConfig, cap: u32) -> Result<Gaussians> {
+    let mut model = limit(gaussians_from_points(points, OPACITY, config.sh_degree)?, cap, config.seed);
+    turn(&mut model, config.seed);
+    Ok(model)
+}
+
+/// `count` dark disks at random in a box below the surface (WSGS: in the box of the points). It is as wide as
+/// points and cameras, and as deep as the highest camera is high.
+fn sunken_start(
+    points: &Points,
+    eyes: &[DVec3],
+    surface: &Surface,
+    config: &TrainConfig,
+    count: u32,
+) -> Result<Gaussians> {
+    let positions = points.positions.iter().map(|position| DVec3::from(position.map(f64::from)));
+    let (right, forward) = surface.normal.any_orthonormal_pair();
+    let place = |at: DVec3| [right.dot(at), forward.dot(at)];
+    let (mut low, mut high) = ([f64::MAX; 2], [f64::MIN; 2]);
+    for at in positions.chain(eyes.iter().copied()).filter(|at| at.is_finite()).map(place) {
+        for k in 0..2 {
+            low[k] = low[k].min(at[k]);
+            high[k] = high[k].max(at[k]);
+        }
+    }
+    let deepest = eyes.iter().map(|eye| surface.height(*eye)).fold(0.0, f64::max);
+    let at = |index: u32| {
+        let share = random_bits(config.seed, Stream::Sets, index, 1).map(|bits| f64::from(uniform(bits)));
+        let across = [0, 1].map(|k| low[k] + share[k] * (high[k] - low[k]));
+        across[0] * right + across[1] * forward + (surface.offset - share[2] * deepest) * surface.normal
+    };
+    let mut model = dark_disks((0..count).map(at), config)?;
+    turn(&mut model, config.seed);
+    Ok(model)
+}
+
+/// The start of the reflected set: `count` dark disks on a dome over the surface, facing its middle. The
+/// paper has them at random in the box of the points. There they begin between surface and cameras, where
+/// there is only air, and hide what is reflected.
+fn dome_start(
+    pivot: DVec3,
+    eyes: &[DVec3],
+    surface: &Surface,
+    config: &TrainConfig,
+    count: u32,
+) -> Result<Gaussians> {
+    let (right, forward) = surface.normal.any_orthonormal_pair();
+    let away = eyes.iter().map(|eye| eye.distance(pivot)).sum::<f64>() / eyes.len().max(1) as f64;
+    let direction = |index: u32| {
+        let share = random_bits(config.seed, Stream::Sets, index, 0).map(|bits| f64::from(uniform(bits)));
+        // Uniform over the half sphere.
+        let (up, turn) = (share[0], std::f64::consts::TAU * share[1]);
+        let level = (1.0 - up * up).sqrt();
+        let out = up * surface.normal + level * (turn.cos() * right + turn.sin() * forward);
+        (out, NEAREST_DOME + (FARTHEST_DOME - NEAREST_DOME) * share[2])
+    };
+    let places = (0..count).map(|index| {
+        let (out, far) = direction(index);
+        pivot + far * away * out
+    });
+    let mut model = dark_disks(places, config)?;
+    for (quat, index) in model.quats.iter_mut().zip(0..) {
+        let facing = glam::DQuat::from_rotation_arc(DVec3::Z, -direction(index).0);
+        *quat = [facing.w, facing.x, facing.y, facing.z].map(|value| value as f32);
+    }
+    Ok(model)
+}
+
+fn dark_disks(places: impl Iterator<Item = DVec3>, config: &TrainConfig) -> Result<Gaussians> {
+    let mut points = Points::default();
+    for place in places {
+        points.push(place.to_array(), [0; 3]);
+    }
+    let mut model = gaussians_from_points(&points, OPACITY, config.sh_degree)?;
+    let coefficients = (usize::from(config.sh_degree) + 1).pow(2);
+    model.sh_coeffs.iter_mut().step_by(coefficients).for_each(|colour| *colour = [(DARK - 0.5) / SH_C0; 3]);
+    Ok(model)
+}

@@ -1,0 +1,33 @@
+//@ import frame, gaussian, surface
+// Makes the disks of a block below the water surface black and mostly masked, so that what refracted light
+// explains can leave the scene above water (WSGS, section 4.3). The published code blackens those above
+// instead. Disks within the margin below the surface stay: they may belong to a rim at the height of the
+// water.
+//
+// One thread per disk.
+
+@group(0) @binding(0) var<uniform> block: Block;
+@group(0) @binding(1) var<uniform> surface: Surface;
+@group(0) @binding(2) var<storage, read_write> transforms: array<vec4<f32>>;
+@group(0) @binding(3) var<storage, read_write> sh_coeffs: array<vec4<f32>>;
+
+// The logit of a mask of a tenth. The paper has a half; then black disks that are half seen keep the picture
+// dark, and refracted light grows too bright to make up for it.
+const MOSTLY_WATER: f32 = -2.2;
+
+@compute @workgroup_size(64)
+fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
+        @builtin(local_invocation_index) lane: u32) {
+    let i = folded(group, groups) * 64u + lane;
+    if i >= block.count {
+        return;
+    }
+    let depth = surface.offset - dot(surface.normal, transforms[3u * i].xyz);
+    if depth <= surface.margin {
+        return;
+    }
+    // The third number of a disk is the logit of its mask.
+    transforms[3u * i + 2u].z = min(transforms[3u * i + 2u].z, MOSTLY_WATER);
+    let at = i * block.sh_stride;
+    sh_coeffs[at] = vec4<f32>(vec3<f32>(-0.5 / 0.28209479177387814), sh_coeffs[at].w);
+}
