@@ -12,8 +12,6 @@
 @group(0) @binding(5) var<storage, read_write> counters_c: array<u32>;
 @group(0) @binding(6) var<storage, read_write> args_c: array<u32>;
 
-const LAST_ARG: u32 = ARGS_BLOCK + 256u;
-
 @compute @workgroup_size(1)
 fn main() {
     let a = counters[OVERFLOW];
@@ -38,7 +36,7 @@ fn main() {
     counters_b[VISIBLE] = 0u;
     counters_c[VISIBLE] = 0u;
     // x, y and z of an indirect dispatch.
-    for (var k = 3u * ARGS_BLOCK; k < 3u * min(LAST_ARG, arrayLength(&args) / 3u); k++) {
+    for (var k = 3u * ARGS_BLOCK; k < arrayLength(&args); k++) {
         args[k] = 0u;
         args_b[k] = 0u;
         args_c[k] = 0u;

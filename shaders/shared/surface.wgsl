@@ -11,8 +11,7 @@ struct Surface {
     schlick: u32,
     // 1: reflected and refracted light add in sRGB, in place of linear light.
     as_shown: u32,
-    // Depth from which on a disk is clearly below (mask_reset.wgsl), scene units.
-    margin: f32,
+    pad: f32,
 }
 
 // The plane in the camera's frame: normal.x = -height.

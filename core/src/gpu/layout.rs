@@ -446,7 +446,7 @@ pub struct SurfaceUniform {
     pub eta: f32,
     pub schlick: u32,
     pub as_shown: u32,
-    pub margin: f32,
+    pub pad: f32,
 }
 
 /// `SurfaceStep` of `surface_step.wgsl`.

@@ -9,11 +9,10 @@ pub mod optics;
 mod prior;
 mod record;
 
+pub use crate::config::SurfaceStart;
 pub use model::SurfaceModel;
 pub use optics::{AIR, Surface, WATER};
-pub use prior::{
-    SurfaceError, SurfaceOptions, SurfacePrior, SurfaceStandardErrors, SurfaceStart, WetPoint, surface_prior,
-};
+pub use prior::{SurfaceError, SurfaceOptions, SurfacePrior, SurfaceStandardErrors, WetPoint, surface_prior};
 pub use record::{SurfaceRecord, SurfaceSource};
 
 #[cfg(test)]

@@ -28,6 +28,7 @@ use glam::DVec3;
 use super::optics::{AIR, Surface, WATER};
 use crate::CoreError;
 use crate::Result as CoreResult;
+use crate::config::SurfaceStart;
 use crate::scene::{PinholeCamera, Points, Pose, Scene, viewing_distance};
 use fit::Noise;
 use sightings::{Eye, Sightings};
@@ -61,17 +62,6 @@ pub struct SurfaceOptions {
     pub up: Option<DVec3>,
     /// How what is not given is found.
     pub start: SurfaceStart,
-}
-
-/// How a surface is found.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum SurfaceStart {
-    /// From the tracks.
-    #[default]
-    Tracks,
-    /// By the rule of the paper of WSGS: the offset is halfway between the lowest camera and the points that
-    /// straight rays explain worst. A normal that is not given is the direction up.
-    Paper,
 }
 
 impl Default for SurfaceOptions {

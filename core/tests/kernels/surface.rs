@@ -31,9 +31,6 @@ pub struct Pool {
     pub water: WaterSurface,
 }
 
-/// Depth from which on a disk is clearly below the surface, scene units.
-pub const MARGIN: f32 = 0.02;
-
 impl Pool {
     fn new(name: &'static str, target: DVec3, schlick: bool, as_shown: bool) -> Self {
         let (width, height) = (75, 53);
@@ -45,7 +42,7 @@ impl Pool {
             eta: (AIR / WATER) as f32,
             schlick: schlick.into(),
             as_shown: as_shown.into(),
-            margin: MARGIN,
+            pad: 0.0,
         };
         let plane = Surface {
             normal: normal.as_dvec3(),

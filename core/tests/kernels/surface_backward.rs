@@ -21,7 +21,7 @@ use glam::DVec3;
 
 use crate::device::{assert_same_bits, device, layouts, poison, storage};
 use crate::disks::{assert_parameters, from_numbers, numbers, sums};
-use crate::surface::{MARGIN, Pool, Seen, Traced, sets};
+use crate::surface::{Pool, Seen, Traced, sets};
 use crate::view::{View, gradients_only};
 
 /// Gradients of the picture at random, zero where a pixel of either set is not decided.
@@ -416,7 +416,7 @@ fn a_mask_reset_blackens_disks_below_the_surface_only() {
     let (mut expected, mut below) = (before.clone(), 0);
     for i in 0..before.len() {
         let height = pool.water.plane.height(DVec3::from_array(before.means[i].map(f64::from)));
-        if height < -f64::from(MARGIN) {
+        if height < 0.0 {
             below += 1;
             expected.log_scales[i][2] = before.log_scales[i][2].min(-2.2);
             // Coefficient 0 times its basis function is -1/2.

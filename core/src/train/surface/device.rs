@@ -45,6 +45,8 @@ struct Maps {
 pub struct DeviceSurface {
     plane: wgpu::Buffer,
     state: wgpu::Buffer,
+    /// About which the plane turns, world axes.
+    turns_about: [f32; 3],
     pivot: wgpu::Buffer,
     step: wgpu::Buffer,
     mask_loss: wgpu::Buffer,
@@ -78,11 +80,9 @@ impl DeviceSurface {
         Ok(Self {
             plane: buffer,
             state: gpu.buffer("moments of the surface", size_of::<SurfaceState>() as u64)?,
+            turns_about: pivot,
             pivot: gpu.uniform("pivot", &[pivot[0], pivot[1], pivot[2], 0.0]),
-            step: gpu.uniform(
-                "step of the surface",
-                &SurfaceStepUniform { pivot, ..SurfaceStepUniform::default() },
-            ),
+            step: gpu.uniform("step of the surface", &SurfaceStepUniform::default()),
             mask_loss: gpu.uniform("mask loss", &MaskLossUniform::default()),
             maps: Maps::new(gpu, 1)?,
         })
@@ -246,7 +246,7 @@ impl DeviceSurface {
         step: SurfaceStepUniform,
     ) -> Result<()> {
         let rows = u64::from(pixels).div_ceil(GROUP) as u32;
-        gpu.write(&self.step, 0, &[SurfaceStepUniform { rows, ..step }]);
+        gpu.write(&self.step, 0, &[SurfaceStepUniform { rows, pivot: self.turns_about, ..step }]);
         recorder.dispatch(
             "surface_gradients",
             Size::Items(pixels, 64),

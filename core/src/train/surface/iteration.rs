@@ -257,7 +257,6 @@ impl SurfaceTrainer {
             tilt_rate: if tilts { self.config.tilt_lr } else { 0.0 },
             unbias1: (1.0 / (1.0 - BETA1.powf(steps))) as f32,
             unbias2: (1.0 / (1.0 - BETA2.powf(steps))) as f32,
-            pivot: self.pivot,
             ..SurfaceStepUniform::default()
         };
         self.device.record_step(gpu, recorder, self.frames(), pixels, step)

@@ -57,7 +57,6 @@ pub struct SurfaceTrainer {
     /// First iteration of all three sets.
     from: u32,
     masks: PseudoMasks,
-    pivot: [f32; 3],
     iteration: u32,
     digest: [u8; 32],
 }
@@ -71,7 +70,7 @@ pub fn uniform_of(record: &SurfaceRecord) -> SurfaceUniform {
         eta: (AIR / surface.ior) as f32,
         schlick: u32::from(record.reflectance == Reflectance::Schlick),
         as_shown: u32::from(record.light == SurfaceLight::Srgb),
-        margin: 0.0,
+        pad: 0.0,
     }
 }
 
@@ -93,8 +92,7 @@ impl SurfaceTrainer {
         let SurfaceRun { record, pivot, reflected, refracted, config } = surface;
         let iterations = run.config.iterations;
         let from = share_of(iterations, config.from).min(iterations);
-        let uniform = SurfaceUniform { margin: config.reset_margin * run.extent, ..uniform_of(&record) };
-        let device = DeviceSurface::new(&gpu, uniform, pivot.as_vec3().to_array())?;
+        let device = DeviceSurface::new(&gpu, uniform_of(&record), pivot.as_vec3().to_array())?;
         let caps = caps(run.config.max_gaussians, config.shares);
         let side = |focus: Gaussians, cap: u32, seed: u32, own: TrainConfig| TrainRun {
             config: TrainConfig {
@@ -135,7 +133,6 @@ impl SurfaceTrainer {
             record,
             from,
             masks,
-            pivot: pivot.as_vec3().to_array(),
             iteration: 0,
             digest,
         };
@@ -304,10 +301,10 @@ const SLOW: f32 = 0.1;
 
 /// The settings of the reflected set.
 ///
-/// The surface reflects a few percent of the light, so its gradients are mostly noise of what lies in the
-/// water. Adam scales them to full size: shapes and opacities would walk at random, and harmonics would fit
-/// single photographs. The weights on opacity and scale assume gradients as large as those of the picture,
-/// and would leave nothing of the set.
+/// The surface reflects a few percent of the light. The weights on opacity and scale assume gradients as
+/// large as those of the picture: with them, nothing of the set was left on a pool. Adam scales small
+/// gradients to full size, with their noise, so the set has no harmonics, and its shapes move slowly. That
+/// alone gained nothing yet (29.9 dB in the water with and without, one seed).
 fn of_reflections(config: &TrainConfig) -> TrainConfig {
     TrainConfig {
         sh_degree_at: [2.0; 3],
