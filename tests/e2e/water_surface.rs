@@ -59,6 +59,8 @@ fn a_pool_becomes_a_model_with_and_without_water() {
     }
     let (_, said) = fail(&["render", &out, "--cameras", &scene, "--allow-cpu", "--ior", "0.9"]);
     assert!(said.contains("above that of air"), "{said}");
+    let (_, said) = fail(&["render", &out, "--cameras", &scene, "--allow-cpu", "--white-point", "1,1,1"]);
+    assert!(said.contains("add --no-surface"), "{said}");
     let model = under(folder.path(), "out/sets/refracted.ply");
     let (_, said) = fail(&["render", &model, "--cameras", &scene, "--allow-cpu", "--no-surface"]);
     assert!(said.contains("no folder `sets`"), "{said}");

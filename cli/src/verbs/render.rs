@@ -174,6 +174,12 @@ fn render(args: RenderArgs) -> Result<()> {
     }
     let gpu = args.gpu.open()?;
     let mut surface = args.surface(&gpu, &path)?;
+    if surface.is_some() && !args.white_point.is_none() {
+        return Err(CliError::Message(
+            "--white-point and --chart are for pictures without the water surface; add --no-surface"
+                .to_owned(),
+        ));
+    }
     let mut renderer = Renderer::new(gpu, &model)?
         .drawn(fathom_core::ply::drawing(&path)?)?
         .with_water(args.water_view(&path)?);
