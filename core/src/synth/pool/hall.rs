@@ -81,8 +81,9 @@ fn hall(yard: &mut Yard, basin: &Basin) {
             block(yard, middle - half, middle + half, Material::Lamp);
         }
     }
-    // The floor around the basin.
-    let [bx, bz] = basin.half;
+    // The floor around the walls of the basin. It does not reach into them: of two faces in one plane, rays
+    // would meet now one, now the other.
+    let [bx, bz] = basin.half.map(|half| half + WALL);
     for (low, high) in
         [([-x, -z], [x, -bz]), ([-x, bz], [x, z]), ([-x, -bz], [-bx, bz]), ([bx, -bz], [x, bz])]
     {
