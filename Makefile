@@ -65,8 +65,9 @@ bench: build ## times of the trainer on this machine, compared with BASELINE=<co
 accept: build ## reruns the claimed figures into bench/history.jsonl and BENCHMARKS.md; hours
 	@scripts/accept.sh
 
-ablation: build ## effect of each part of the water and the partitions, as a table of BENCHMARKS.md; hours
+ablation: build ## effect of each part of the water and the partitions, as a table of BENCHMARKS.md, and of method wsgs; hours
 	@scripts/ablation.py
+	scripts/surface_ablation.sh
 
 dist: ## a stripped binary for this machine's Linux with checksum and licences, under out/dist; 15 minutes on 2 cores
 	@scripts/dist.sh

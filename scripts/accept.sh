@@ -739,7 +739,8 @@ for run in json.load(open(sys.argv[1]))["runs"]:
 }
 
 # A pool seen through its surface: method wsgs against 3dgs at equal totals, three seeds, and the surface that
-# is trained from a wrong start. Two hours on two cores; FATHOM_ACCEPT_ITERATIONS="3000 10000" adds long runs.
+# is trained from a wrong start, and a long pool in partitions. Two hours on two cores;
+# FATHOM_ACCEPT_ITERATIONS="3000 10000" adds long runs.
 wsgs() {
     local program pool="$out/pool" iterations seed method kind least
     program=$(example train_surface) || { miss "train_surface does not build"; return 0; }
@@ -771,6 +772,26 @@ wsgs() {
         { miss "the shifted surface does not train"; return 0; }
     row "pool/shifted" "train_surface POOL --shift 0.18 --surface refine=offset --surface refine_until=1" \
         "the offset ends $(number offset_error "$out/pool-shifted.json") m off" "offset_error=$(number offset_error "$out/pool-shifted.json")"
+    long_pool
+}
+# A pool of 4 m in 2x2 partitions against one.
+long_pool() {
+    local pool="$out/long-pool" grid settings=(--preset wsgs --iterations 3000 --max-gaussians 16000)
+    [ -d "$pool" ] || "$fathom" synth "$pool" --kind pool --length 4 --size 128x96 --views 96 >"$out/long-pool.log"
+    for grid in 1x1 2x2; do
+        train "long-pool-$grid" "$pool" --partitions "$grid" --workers 2 "${settings[@]}" ||
+            { miss "the long pool does not train in $grid"; return 0; }
+        row "long-pool/$grid" "fathom train POOL --partitions $grid ${settings[*]}" "$(brief "$out/long-pool-$grid/metrics.json")" \
+            "psnr=$(number psnr "$out/long-pool-$grid/metrics.json")"
+    done
+    python3 - "$out" <<'PY' || miss "2x2 partitions cost a long pool more than 0.3 dB, or a view more than 1 dB"
+import json, sys
+whole, cut = (json.load(open(f"{sys.argv[1]}/long-pool-{grid}/metrics.json")) for grid in ("1x1", "2x2"))
+views = {view["name"]: view["psnr"] for view in whole["views"]}
+worst = min(view["psnr"] - views[view["name"]] for view in cut["views"])
+print(f"long pool: {cut['psnr'] - whole['psnr']:+.2f} dB in 2x2, worst view {worst:+.2f} dB")
+sys.exit(cut["psnr"] < whole["psnr"] - 0.3 or worst < -1.0)
+PY
 }
 gains() { # iterations, kind, least gain of wsgs over 3dgs in dB
     local gain

@@ -1,8 +1,9 @@
 //@ import frame, surface, water, surface_light
 // The picture of a scene with a water surface from those of its three sets of disks (WSGS, eq. 11 and 12).
 //
-//   water = F reflected + (1 - F) refracted, added as light; picture = (1 - R) water + R straight
-//   image            [H*W] vec4 of rasterize_disks: straight
+//   water = F reflected + (1 - F) refracted, added as light
+//   picture = (1 - alpha) water + straight, or with masks (1 - R) water + R straight
+//   image            [H*W] vec4 of rasterize_disks: straight, alpha
 //   normal_image     [H*W] vec4: R, the blended mask, is the last number
 //   refracted_rays   [H*W*2] vec4 of surface_rays: whether the pixel has rays, and F
 //   picture          [H*W] vec4: rgb, alpha; the latter is 1 on water
@@ -30,7 +31,8 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         return;
     }
     let share = refracted_rays[2u * i + 1u].w;
-    let R = normal_image[i].w;
+    let cover = cover_of(surface, straight.w, normal_image[i].w);
+    let worth = select(cover, 1.0, surface.over != 0u);
     let light = share * light_of(surface, reflected[i].xyz) + (1.0 - share) * light_of(surface, refracted[i].xyz);
-    picture[i] = vec4<f32>((1.0 - R) * shown_of(surface, light) + R * straight.xyz, 1.0);
+    picture[i] = vec4<f32>((1.0 - cover) * shown_of(surface, light) + worth * straight.xyz, 1.0);
 }

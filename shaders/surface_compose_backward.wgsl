@@ -36,21 +36,23 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         return;
     }
     let share = refracted_rays[2u * i + 1u].w;
-    let R = normal_image[i].w;
+    let cover = cover_of(surface, image[i].w, normal_image[i].w);
     let up = reflected[i].xyz;
     let down = refracted[i].xyz;
     let light_up = light_of(surface, up);
     let light_down = light_of(surface, down);
     let light = share * light_up + (1.0 - share) * light_down;
     let v = v_image[i].xyz;
-    v_mask_image[i] = dot(v, image[i].xyz - shown_of(surface, light));
     let one = vec3<f32>(1.0);
     let as_shown = surface.as_shown != 0u;
-    let v_light = (1.0 - R) * v * select(encoded_slope(light), one, as_shown);
+    let v_light = (1.0 - cover) * v * select(encoded_slope(light), one, as_shown);
     let v_up = share * v_light * select(decoded_slope(up), one, as_shown);
     let v_down = (1.0 - share) * v_light * select(decoded_slope(down), one, as_shown);
     v_reflected[i] = vec4<f32>(v_up, dot(v_up, up));
     v_refracted[i] = vec4<f32>(v_down, dot(v_down, down));
     v_fresnel[i] = dot(v_light, light_up - light_down);
-    v_image[i] = vec4<f32>(R * v, 0.0);
+    let v_water = dot(v, shown_of(surface, light));
+    let over = surface.over != 0u;
+    v_mask_image[i] = select(dot(v, image[i].xyz) - v_water, 0.0, over);
+    v_image[i] = select(vec4<f32>(cover * v, 0.0), vec4<f32>(v, -v_water), over);
 }

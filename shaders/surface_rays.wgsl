@@ -1,8 +1,8 @@
 //@ import frame, surface
 // The reflected and the refracted ray of every pixel whose ray meets the water surface (WSGS, eq. 7 to 9).
 //
-//   normal_image    [H*W] vec4 of rasterize_disks: the blended mask of the scene above water is its last
-//                   number
+//   image           [H*W] vec4 of rasterize_disks: rgb, alpha of the scene above water
+//   normal_image    [H*W] vec4: its blended mask is the last number
 //   reflected_rays  [H*W*2] vec4: (origin, 1 or 0 for no ray), (unit direction, F). In the frame of the
 //                   mirrored camera, where the ray goes straight on
 //   refracted_rays  [H*W*2] vec4: the same in the frame of the camera
@@ -11,13 +11,14 @@
 
 @group(0) @binding(0) var<uniform> frame: Frame;
 @group(0) @binding(1) var<uniform> surface: Surface;
-@group(0) @binding(2) var<storage, read> normal_image: array<vec4<f32>>;
-@group(0) @binding(3) var<storage, read_write> reflected_rays: array<vec4<f32>>;
-@group(0) @binding(4) var<storage, read_write> refracted_rays: array<vec4<f32>>;
+@group(0) @binding(2) var<storage, read> image: array<vec4<f32>>;
+@group(0) @binding(3) var<storage, read> normal_image: array<vec4<f32>>;
+@group(0) @binding(4) var<storage, read_write> reflected_rays: array<vec4<f32>>;
+@group(0) @binding(5) var<storage, read_write> refracted_rays: array<vec4<f32>>;
 
 // Least cosine with the normal of a ray that meets the surface.
 const LEAST_COSINE: f32 = 1e-3;
-// From this blended mask on, a pixel shows nothing but the scene above water.
+// From this cover on, a pixel shows nothing but the scene above water.
 const DRY: f32 = 0.999;
 
 @compute @workgroup_size(64)
@@ -33,7 +34,8 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let level = level_of(frame, surface);
     let n = level.normal;
     let cos_i = -dot(n, d);
-    if !(cos_i > LEAST_COSINE && level.height > 0.0 && normal_image[i].w < DRY) {
+    let cover = cover_of(surface, image[i].w, normal_image[i].w);
+    if !(cos_i > LEAST_COSINE && level.height > 0.0 && cover < DRY) {
         reflected_rays[2u * i] = vec4<f32>(0.0);
         reflected_rays[2u * i + 1u] = vec4<f32>(0.0, 0.0, 1.0, 0.0);
         refracted_rays[2u * i] = vec4<f32>(0.0);

@@ -161,11 +161,11 @@ fn main() -> Fallible<()> {
     let mut prior_seconds = 0.0;
     let (mut shown, surface, counts, model): (Shown, Option<Surface>, Vec<usize>, Option<SurfaceModel>) =
         if method == "wsgs" {
-            let mut surface =
+            let (straight, mut surface) =
                 surface_run(&scene.points, run.views.views(), &scene_views, &config, &settings)?;
             prior_seconds = started.elapsed().as_secs_f64();
             surface.record.offset += shift;
-            run.surface = Some(surface);
+            (run.focus, run.surface) = (straight, Some(surface));
             let mut trainer = SurfaceTrainer::new(Arc::clone(&gpu), run)?;
             while trainer.progress().iteration < config.iterations {
                 let progress = trainer.advance(250)?;

@@ -11,7 +11,13 @@ struct Surface {
     schlick: u32,
     // 1: reflected and refracted light add in sRGB, in place of linear light.
     as_shown: u32,
-    pad: f32,
+    // 1: the straight picture lies over that of the water. 0: its masks join them.
+    over: u32,
+}
+
+// By how much the scene above water covers the water.
+fn cover_of(surface: Surface, alpha: f32, mask: f32) -> f32 {
+    return select(mask, alpha, surface.over != 0u);
 }
 
 // The plane in the camera's frame: normal.x = -height.

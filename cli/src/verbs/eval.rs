@@ -206,15 +206,16 @@ fn measure(args: &EvalArgs) -> Result<Value> {
         };
         let (psnr, ssim) = (metrics::psnr(&render, &photograph), map.as_ref().map(SsimMap::mean));
         let mut of_view = json!({ "name": view.name, "psnr": psnr, "ssim": ssim });
-        let clear = match through(Output::Restored) {
-            // The scene without its water surface.
-            None if surface.is_some() => {
-                let clear = renderer.render(&camera, &view.pose, [0.0; 3])?;
-                metrics::quantised(clear.width, clear.height, &clear.rgb)
-            }
+        // The scene without its water surface: what covers a pixel is seen straight there.
+        let dry = match &surface {
+            Some(_) => Some(renderer.render(&camera, &view.pose, [0.0; 3])?),
+            None => None,
+        };
+        let clear = match (through(Output::Restored), &dry) {
+            (_, Some(dry)) => metrics::quantised(dry.width, dry.height, &dry.rgb),
             // Without a medium, the render itself is compared with J.
-            None => render.clone(),
-            output => {
+            (None, None) => render.clone(),
+            (output, None) => {
                 renderer.set_water(output);
                 let clear = renderer.render(&camera, &view.pose, [0.0; 3])?;
                 let clear = metrics::quantised(clear.width, clear.height, &clear.rgb);
@@ -245,8 +246,8 @@ fn measure(args: &EvalArgs) -> Result<Value> {
             index,
             camera: &camera,
             pose: &view.pose,
-            alpha: &rendered.alpha,
-            range: &rendered.range,
+            alpha: &dry.as_ref().unwrap_or(&rendered).alpha,
+            range: &dry.as_ref().unwrap_or(&rendered).range,
             photograph: &photograph,
             clear: water.as_ref().map(|_| &clear),
             truth: truth.as_ref().filter(|truth| truth.says_where).map(|truth| &truth.clear),

@@ -32,6 +32,8 @@ pub struct Candidate {
     covariance: [f32; 6],
     /// Constant colour, without the offset of 0.5.
     colour: [f32; 3],
+    /// [`Splat::set`]: two of different sets are not seen by the same rays.
+    set: f32,
 }
 
 /// The first one stays: the more opaque one, among equals the one with the smaller content hash. The position
@@ -123,14 +125,23 @@ impl Bounds {
         let content = blake3::hash(row);
         let [a, b, c, d, e, f, g, h, ..] = *content.as_bytes();
         let content = u64::from_le_bytes([a, b, c, d, e, f, g, h]);
-        usable.then_some(Candidate { id, content, logit, mean, reach, covariance, colour: splat.colour })
+        usable.then_some(Candidate {
+            id,
+            content,
+            logit,
+            mean,
+            reach,
+            covariance,
+            colour: splat.colour,
+            set: splat.set,
+        })
     }
 
     /// Whether two Gaussians are duplicates; symmetric.
     pub fn agree(&self, a: &Candidate, b: &Candidate) -> bool {
         let offset = DVec3::from(a.mean.map(f64::from)) - DVec3::from(b.mean.map(f64::from));
         let colours = (0..3).all(|channel| (a.colour[channel] - b.colour[channel]).abs() <= self.colour);
-        if !colours || offset.length_squared() > f64::from(a.reach).powi(2) {
+        if a.set != b.set || !colours || offset.length_squared() > f64::from(a.reach).powi(2) {
             return false;
         }
         let (one, other) = (a.covariance(), b.covariance());
@@ -157,6 +168,7 @@ mod tests {
             log_scales: scales.map(f32::ln),
             quat_wxyz: [quat.w, quat.x, quat.y, quat.z].map(|v| v as f32),
             colour,
+            set: 0.0,
         };
         let id = RowId { partition: 0, row: 0 };
         Bounds::new(&MergeConfig::default()).candidate(id, &[1, 2, 3], mean, 0.0, &splat).unwrap()
@@ -205,6 +217,12 @@ mod tests {
     }
 
     #[test]
+    fn disks_of_different_sets_do_not_agree() {
+        let one = gaussian([0.0; 3], [0.1; 3], DQuat::IDENTITY, [0.0; 3]);
+        assert!(agree(&one, &one) && !agree(&one, &Candidate { set: 1.0, ..one }));
+    }
+
+    #[test]
     fn gaussians_that_agree_are_within_reach_of_each_other() {
         let narrow = gaussian([0.0; 3], [0.1; 3], DQuat::IDENTITY, [0.0; 3]);
         let wide = |x: f32| gaussian([x, 0.0, 0.0], [0.1499; 3], DQuat::IDENTITY, [0.0; 3]);
@@ -215,7 +233,8 @@ mod tests {
     #[test]
     fn gaussians_without_a_shape_are_no_candidates() {
         let bounds = Bounds::new(&MergeConfig::default());
-        let sound = Splat { log_scales: [0.0; 3], quat_wxyz: [1.0, 0.0, 0.0, 0.0], colour: [0.0; 3] };
+        let sound =
+            Splat { log_scales: [0.0; 3], quat_wxyz: [1.0, 0.0, 0.0, 0.0], colour: [0.0; 3], set: 0.0 };
         let is_one = |splat: Splat| {
             bounds.candidate(RowId { partition: 0, row: 0 }, &[], [0.0; 3], 0.0, &splat).is_some()
         };

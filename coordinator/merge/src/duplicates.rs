@@ -249,7 +249,12 @@ mod tests {
     }
 
     fn ball(partition: u32, row: u32, mean: [f32; 3], radius: f32, logit: f32) -> Candidate {
-        let splat = Splat { log_scales: [radius.ln(); 3], quat_wxyz: [1.0, 0.0, 0.0, 0.0], colour: [0.0; 3] };
+        let splat = Splat {
+            log_scales: [radius.ln(); 3],
+            quat_wxyz: [1.0, 0.0, 0.0, 0.0],
+            colour: [0.0; 3],
+            set: 0.0,
+        };
         let content = [partition, row].map(u32::to_le_bytes).concat();
         bounds().candidate(RowId { partition, row }, &content, mean, logit, &splat).unwrap()
     }

@@ -38,6 +38,7 @@ struct SplatOffsets {
     log_scales: [usize; 3],
     quat_wxyz: [usize; 4],
     colour: [usize; 3],
+    set: Option<usize>,
 }
 
 /// Shape and colour of a row, as stored in the file.
@@ -49,6 +50,8 @@ pub struct Splat {
     pub quat_wxyz: [f32; 4],
     /// Coefficients of the constant harmonic.
     pub colour: [f32; 3],
+    /// The set in a scene with a water surface, in the first column of normals; other models leave it 0.
+    pub set: f32,
 }
 
 impl Layout {
@@ -79,6 +82,7 @@ impl Layout {
             log_scales: splat.log_scales.map(|at| float(row, at)),
             quat_wxyz: splat.quat_wxyz.map(|at| float(row, at)),
             colour: splat.colour.map(|at| float(row, at)),
+            set: splat.set.map_or(0.0, |at| float(row, at)),
         })
     }
 
@@ -296,6 +300,7 @@ fn read_header(path: &Path, reader: &mut impl BufRead) -> Result<(Layout, u64, V
             log_scales: three("scale_")?,
             quat_wxyz: [w, x, y, offset("rot_3")?],
             colour: three("f_dc_")?,
+            set: offset("nx"),
         })
     })();
     let layout = Layout { row_bytes, offsets: [x, y, z, opacity], splat, lines, properties };

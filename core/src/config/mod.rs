@@ -34,7 +34,7 @@ pub use network::{NetworkConfig, NetworkStart};
 pub use partitions::WaterPartitions;
 pub use priors::{DarkChannelOn, PriorsConfig};
 pub use seams::SeamsConfig;
-pub use surface::{Reflectance, SurfaceConfig, SurfaceLight, SurfaceRefine, SurfaceStart};
+pub use surface::{Reflectance, SurfaceConfig, SurfaceJoin, SurfaceLight, SurfaceRefine, SurfaceStart};
 pub use train::{ClassicConfig, Moments, Strategy, TrainConfig};
 pub use water::{Blend, LossLight, Medium, WaterConfig, WaterPrior};
 pub use weights::{WeightMode, WeightTerms};
@@ -319,8 +319,13 @@ impl JobConfig {
         );
         if self.method == Method::Surface {
             require(
-                p.columns == 1 && p.rows == 1 && !p.auto,
-                "method = \"wsgs\" trains one partition; partition.columns and rows must be 1, and auto false",
+                self.surface.join == SurfaceJoin::Over || (p.columns == 1 && p.rows == 1 && !p.auto),
+                "surface.join = \"masked\" trains one partition; partition.columns and rows must be 1, and auto \
+                 false",
+            );
+            require(
+                p.neighbours_from >= 1.0,
+                "method = \"wsgs\" does not exchange neighbours; partition.neighbours_from must be 1",
             );
             require(
                 self.water.medium == Medium::None,

@@ -37,6 +37,17 @@ pub enum SurfaceLight {
     Srgb,
 }
 
+/// How the scene above water lies over what the water shows.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum SurfaceJoin {
+    /// As any disk lies over what is behind it: water shows through where the scene above is transparent.
+    #[default]
+    Over,
+    /// By masks that are trained (WSGS eq. 12).
+    Masked,
+}
+
 /// Where the water surface comes from.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -67,9 +78,14 @@ pub struct SurfaceConfig {
     pub reflectance: Reflectance,
     /// How reflected and refracted light add: `linear` or `srgb`. Default `linear`.
     pub light: SurfaceLight,
-    /// Share of the run before which only the scene above water is trained. Default 18/70 (WSGS).
+    /// How the scene above water lies over what the water shows: `over` or `masked`. Default `over`: water
+    /// shows through where the scene above is transparent. `masked` is that of the paper (eq. 12); mask and
+    /// reset settings count for it only.
+    pub join: SurfaceJoin,
+    /// Share of the run before which only the scene above water is trained. Default 0; the
+    /// paper has 18/70, which `masked` needs.
     pub from: f32,
-    /// Shares of the cap: scene above water, refracted set, reflected set. Default 0.6, 0.25, 0.15.
+    /// Shares of the cap: scene above water, refracted set, reflected set. Default 0.45, 0.48, 0.07.
     pub shares: [f32; 3],
     /// Weight of the loss between mask and pseudo-mask (WSGS eq. 15). Default 0.5; the paper has 0.05, in
     /// runs that are twenty times as long.
@@ -141,8 +157,9 @@ impl Default for SurfaceConfig {
             refine: SurfaceRefine::Fixed,
             reflectance: Reflectance::Fresnel,
             light: SurfaceLight::Linear,
-            from: 18.0 / 70.0,
-            shares: [0.6, 0.25, 0.15],
+            join: SurfaceJoin::Over,
+            from: 0.0,
+            shares: [0.45, 0.48, 0.07],
             mask_weight: 0.5,
             mask_from: 18.0 / 70.0,
             pseudo_masks: 8,

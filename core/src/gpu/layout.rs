@@ -446,7 +446,7 @@ pub struct SurfaceUniform {
     pub eta: f32,
     pub schlick: u32,
     pub as_shown: u32,
-    pub pad: f32,
+    pub over: u32,
 }
 
 /// `SurfaceStep` of `surface_step.wgsl`.

@@ -24,7 +24,9 @@ pub const ANTIALIASED: &str = "antialiased: opacity makes up for a low-pass of 0
 pub const DISKS: &str = "disks: 2D Gaussians, whose third scale is not rendered";
 
 pub use rows::replace_rows;
-pub use surface::{read_surface_model, surface_from_bytes, surface_from_rows, surface_to_bytes};
+pub use surface::{
+    read_surface_model, replace_surface_rows, surface_from_bytes, surface_from_rows, surface_to_bytes,
+};
 pub use write::{SplatWriter, to_bytes, write_model, write_whole};
 
 /// The properties of a row for a degree of the spherical harmonics.

@@ -70,6 +70,44 @@ pub fn surface_from_rows<R: std::io::Read>(reader: SplatReader<R>) -> Result<Opt
     read(reader)
 }
 
+/// Replaces disks of a model by those of `with`: disk `indices[set][k]` of set `set` by disk `k` of that set.
+/// The sets are straight, reflected and refracted; indices ascend. `model` holds the bytes of
+/// [`surface_to_bytes`] or a merge of such files. Masks stay.
+///
+/// # Errors
+/// As [`replace_rows`](super::replace_rows).
+pub fn replace_surface_rows(
+    model: &mut [u8],
+    name: &str,
+    indices: [&[usize]; 3],
+    with: [&Gaussians; 3],
+) -> Result<()> {
+    let mut reader = SplatReader::from_bytes(model, name)?;
+    let mut rows: [Vec<usize>; 3] = Default::default();
+    let mut columns: [Vec<[u8; 8]>; 3] = Default::default();
+    let mut seen = [0; 3];
+    while let Some(row) = reader.next_row()? {
+        let set = match super::read::float(row.bytes, SET) {
+            0.0 => 0,
+            2.0 => 1,
+            _ => 2,
+        };
+        if indices[set].get(rows[set].len()) == Some(&seen[set]) {
+            rows[set].push(row.index as usize);
+            columns[set].push(std::array::from_fn(|at| row.bytes[4 * SET + at]));
+        }
+        seen[set] += 1;
+    }
+    let (start, row_bytes) = (reader.rows_as_written_at(), reader.layout().row_bytes());
+    for set in 0..3 {
+        super::replace_rows(model, name, &rows[set], with[set])?;
+        for (row, columns) in rows[set].iter().zip(&columns[set]) {
+            model[start.unwrap_or(0) + row * row_bytes + 4 * SET..][..8].copy_from_slice(columns);
+        }
+    }
+    Ok(())
+}
+
 pub(super) fn read<R: std::io::Read>(mut reader: SplatReader<R>) -> Result<Option<SurfaceModel>> {
     let Some(record) = SurfaceRecord::among(reader.comments())? else { return Ok(None) };
     let layout = reader.layout();
@@ -143,7 +181,33 @@ mod tests {
         let bytes = surface_to_bytes(&model(), &[]).unwrap();
         let dry = super::super::from_bytes(&bytes, "model").unwrap();
         assert_eq!(dry, model().dry());
-        // The first straight disk is masked out, and the reflected ones are no part of the scene.
-        assert_eq!(dry.len(), 4 + 2);
+        // The first straight disk is masked out, the reflected ones are no part of the scene, and the second
+        // refracted one has left the water.
+        assert_eq!(dry.len(), 4 + 1);
+    }
+
+    #[test]
+    fn disks_of_sets_are_replaced_and_no_other_byte() {
+        // As in a merge of partitions, sets are mixed.
+        let written = surface_to_bytes(&model(), &[]).unwrap();
+        let row_bytes = SplatReader::from_bytes(&written, "model").unwrap().layout().row_bytes();
+        let (header, rows) = written.split_at(written.len() - 10 * row_bytes);
+        let order = [8, 0, 5, 1, 2, 9, 6, 7, 3, 4].map(|row| &rows[row * row_bytes..][..row_bytes]);
+        let mut merged = [header, &order.concat()].concat();
+        let before = surface_from_bytes(&merged, "model").unwrap().unwrap();
+        let with = [disks(2, 7.0), Gaussians::empty(1), disks(1, 9.0)];
+        let indices: [&[usize]; 3] = [&[1, 4], &[], &[0]];
+        replace_surface_rows(&mut merged, "model", indices, with.each_ref()).unwrap();
+        let after = surface_from_bytes(&merged, "model").unwrap().unwrap();
+        assert_eq!((&after.masks, &after.reflected), (&before.masks, &before.reflected));
+        let straight = |model: &SurfaceModel, index: usize| model.straight.means[index];
+        for index in 0..5 {
+            let new = [1, 4].iter().position(|changed| *changed == index);
+            let expected = new.map_or(straight(&before, index), |k| with[0].means[k]);
+            assert_eq!(straight(&after, index), expected, "straight disk {index}");
+        }
+        assert_eq!(after.refracted.means, [with[2].means[0], before.refracted.means[1]]);
+        let short = replace_surface_rows(&mut merged, "model", [&[0], &[], &[]], with.each_ref());
+        assert!(short.unwrap_err().to_string().contains("cannot replace 1 rows"));
     }
 }

@@ -2,6 +2,8 @@
 
 use std::path::Path;
 
+use glam::DVec3;
+
 use super::SurfaceRecord;
 use crate::gaussians::Gaussians;
 use crate::ply;
@@ -36,6 +38,53 @@ impl SurfaceModel {
         self.len() == 0
     }
 
+    /// Splits every set by where its disks are.
+    pub fn split_by(&self, mut is_first: impl FnMut([f32; 3]) -> bool) -> (Self, Self) {
+        self.split_where(|set, index| is_first(set.means[index]))
+    }
+
+    /// Splits every set: `is_first` gets the set and the index of a disk in it.
+    pub fn split_where(&self, mut is_first: impl FnMut(&Gaussians, usize) -> bool) -> (Self, Self) {
+        let mut masks = [Vec::new(), Vec::new()];
+        let straight = self.straight.split_where(|index| {
+            let first = is_first(&self.straight, index);
+            masks[usize::from(!first)].extend(self.masks.get(index));
+            first
+        });
+        let mut split = |set: &Gaussians| set.split_where(|index| is_first(set, index));
+        let (reflected, refracted) = (split(&self.reflected), split(&self.refracted));
+        let record = || self.record.clone();
+        let [first_masks, other_masks] = masks;
+        (
+            Self {
+                straight: straight.0,
+                masks: first_masks,
+                reflected: reflected.0,
+                refracted: refracted.0,
+                record: record(),
+            },
+            Self {
+                straight: straight.1,
+                masks: other_masks,
+                reflected: reflected.1,
+                refracted: refracted.1,
+                record: record(),
+            },
+        )
+    }
+
+    /// Adds the disks of another part of the same scene.
+    pub fn append(&mut self, other: &Self) {
+        self.masks.extend(&other.masks);
+        for (set, other) in [
+            (&mut self.straight, &other.straight),
+            (&mut self.reflected, &other.reflected),
+            (&mut self.refracted, &other.refracted),
+        ] {
+            (0..other.len()).for_each(|index| set.push_from(other, index));
+        }
+    }
+
     /// The scene without the surface: the straight set, as far as it is above water, and what lies in the
     /// water, where it is. Every viewer shows it.
     pub fn dry(&self) -> Gaussians {
@@ -50,7 +99,12 @@ impl SurfaceModel {
                 }
             }
         }
-        (0..self.refracted.len()).for_each(|index| dry.push_from(&self.refracted, index));
+        // No ray through the water sees those that have left it.
+        let surface = self.record.surface();
+        let is_below = |mean: [f32; 3]| surface.height(DVec3::from(mean.map(f64::from))) < 0.0;
+        for index in (0..self.refracted.len()).filter(|&index| is_below(self.refracted.means[index])) {
+            dry.push_from(&self.refracted, index);
+        }
         dry
     }
 

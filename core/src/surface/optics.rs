@@ -96,6 +96,19 @@ impl Surface {
         }
     }
 
+    /// What a camera at `eye` sees where it would see `point` without the surface: the place at the same
+    /// depth on the refracted ray. It is `point` itself if that is in air, or the surface is not between.
+    pub fn seen_instead(&self, eye: DVec3, point: DVec3) -> DVec3 {
+        let (along, depth) = ((point - eye).normalize(), -self.height(point));
+        match self.meets(eye, along) {
+            Some(range) if depth > 0.0 => {
+                let bent = self.split(along).refracted;
+                eye + range * along + depth / -bent.dot(self.normal) * bent
+            }
+            _ => point,
+        }
+    }
+
     /// Where the ray from `eye`, in air, to `point`, in the water, crosses the surface. `None` if they are
     /// not on these sides.
     pub fn crossing(&self, eye: DVec3, point: DVec3) -> Option<Crossing> {

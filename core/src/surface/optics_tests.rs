@@ -143,3 +143,19 @@ fn derivatives_of_a_crossing_match_finite_differences() {
     let share = WATER / (AIR + WATER);
     assert!((moved - share * motion.point).length() < 1e-12, "{moved}");
 }
+
+#[test]
+fn a_camera_sees_the_same_depth_along_its_refracted_ray() {
+    for index in 0..40 {
+        let (surface, eye, point) = case(index);
+        let seen = surface.seen_instead(eye, point);
+        assert!((surface.height(seen) - surface.height(point)).abs() < 1e-9);
+        // Its ray through the surface begins in the direction of the point.
+        let crossing = surface.crossing(eye, seen).unwrap();
+        let apart = (crossing.at - eye).normalize().cross((point - eye).normalize()).length();
+        assert!(apart < 1e-6, "case {index}: {apart}");
+        assert_eq!(surface.seen_instead(eye, eye + 0.1 * surface.normal), eye + 0.1 * surface.normal);
+        let in_air = surface.seen_instead(seen, point);
+        assert_eq!(in_air, point, "an eye in the water sees it straight");
+    }
+}

@@ -4,7 +4,7 @@ use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
 use super::{AIR, Surface};
-use crate::config::{Reflectance, SurfaceLight};
+use crate::config::{Reflectance, SurfaceJoin, SurfaceLight};
 use crate::{CoreError, Result};
 
 /// Start of the header comment that holds the record.
@@ -40,6 +40,8 @@ pub struct SurfaceRecord {
     pub reflectance: Reflectance,
     /// How reflected and refracted light add.
     pub light: SurfaceLight,
+    /// How the scene above water lies over the water.
+    pub join: SurfaceJoin,
     /// Where it comes from.
     pub source: SurfaceSource,
     /// Standard error of the offset at the start; null if it was given.
@@ -58,6 +60,7 @@ impl SurfaceRecord {
             ior: surface.ior,
             reflectance: Reflectance::default(),
             light: SurfaceLight::default(),
+            join: SurfaceJoin::default(),
             source: SurfaceSource::Given,
             offset_error: None,
             tilt_error_degrees: None,

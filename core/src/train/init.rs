@@ -33,6 +33,17 @@ pub fn initial_gaussians(
     config: &TrainConfig,
     medium: Option<&MediumRun>,
 ) -> Result<Gaussians> {
+    initial_gaussians_within(points, views, config, medium, |_| true)
+}
+
+/// The same with the background Gaussians whose centres are `within`.
+pub(super) fn initial_gaussians_within(
+    points: &Points,
+    views: &[TrainView],
+    config: &TrainConfig,
+    medium: Option<&MediumRun>,
+    within: impl FnMut([f32; 3]) -> bool,
+) -> Result<Gaussians> {
     let opacity = match config.strategy {
         Strategy::Mcmc => OPACITY,
         Strategy::Classic => OPACITY_CLASSIC,
@@ -42,6 +53,7 @@ pub fn initial_gaussians(
         if shows_open_water { 0 } else { config.background_gaussians.min(config.max_gaussians / FAR_SHARE) };
     let far =
         background_gaussians(points, views, config.sh_degree, shell, medium.map(|medium| &medium.water));
+    let far = far.split_by(within).0;
     let room = config.max_gaussians - far.len() as u32;
     let mut model = limit(gaussians_from_points(points, opacity, config.sh_degree)?, room, config.seed);
     (0..far.len()).for_each(|index| model.push_from(&far, index));

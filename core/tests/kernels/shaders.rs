@@ -99,7 +99,7 @@ fn uniforms_of_the_host_have_the_layout_of_the_shaders() {
         view_unbias2,
     );
     mirror!("normal_consistency", "Normals", NormalsUniform, weight, least_alpha, pad_a, pad_b);
-    mirror!("surface_rays", "Surface", SurfaceUniform, normal, offset, eta, schlick, as_shown, pad,);
+    mirror!("surface_rays", "Surface", SurfaceUniform, normal, offset, eta, schlick, as_shown, over,);
     mirror!(
         "surface_step",
         "SurfaceStep",

@@ -42,7 +42,7 @@ impl Pool {
             eta: (AIR / WATER) as f32,
             schlick: schlick.into(),
             as_shown: as_shown.into(),
-            pad: 0.0,
+            over: (!as_shown).into(),
         };
         let plane = Surface {
             normal: normal.as_dvec3(),
@@ -55,11 +55,11 @@ impl Pool {
             camera,
             pose: Pose::looking_at(eye, target, DVec3::new(0.1, -1.0, 0.0)),
             uniform,
-            water: WaterSurface { plane, schlick, as_shown },
+            water: WaterSurface { plane, schlick, as_shown, over: !as_shown },
         }
     }
 
-    /// From above and towards the horizon, with both reflectances.
+    /// From above and towards the horizon, with both reflectances, ways of adding light, and joins.
     pub fn all() -> [Self; 2] {
         [
             Self::new("steep", DVec3::new(0.1, -0.2, 0.3), false, false),
@@ -157,6 +157,11 @@ impl Seen {
         normals.iter().map(|normal| normal[3].into()).collect()
     }
 
+    /// By how much the straight picture covers the water.
+    pub fn cover(&self) -> Vec<f64> {
+        self.pool.water.cover(&self.pictures()[0]).to_vec()
+    }
+
     /// The rays as the kernel wrote them.
     pub fn rays(&self) -> SurfaceRays {
         let of = |view: &View| -> Vec<[[f32; 4]; 2]> {
@@ -183,9 +188,11 @@ impl Seen {
     pub fn pictures(&self) -> [DiskRaster; 3] {
         let masks = self.masks();
         self.views.each_ref().map(|view| {
-            let rgb = view.image().iter().map(|p| [p[0], p[1], p[2]].map(f64::from)).collect();
+            let image = view.image();
+            let rgb = image.iter().map(|p| [p[0], p[1], p[2]].map(f64::from)).collect();
+            let alpha = image.iter().map(|p| p[3].into()).collect();
             let (width, height) = (self.pool.camera.width, self.pool.camera.height);
-            let raster = Raster { width, height, rgb, ..Raster::default() };
+            let raster = Raster { width, height, rgb, alpha, ..Raster::default() };
             DiskRaster { raster, mask: masks.clone(), ..DiskRaster::default() }
         })
     }
@@ -236,14 +243,14 @@ fn rays_at_the_surface_match_the_twin() {
     for gpu in layouts() {
         for pool in Pool::all() {
             let seen = Seen::new(&gpu, &pool, sets(601, 120, 0));
-            let (kernel, masks) = (seen.rays(), seen.masks());
-            let twin = surface_rays(&pool.water, &pool.camera, &pool.pose, &masks);
+            let (kernel, cover) = (seen.rays(), seen.cover());
+            let twin = surface_rays(&pool.water, &pool.camera, &pool.pose, &cover);
             let n = pool.water.plane.normal;
             let mut hits = 0;
-            for (i, mask) in masks.iter().enumerate() {
+            for (i, covered) in cover.iter().enumerate() {
                 let cosine = -n.dot(pool.pose.rotation.inverse() * pool.camera.direction(i));
                 // Rounding decides whether a ray grazes the surface.
-                if (cosine - 1e-3).abs() < 1e-5 || (mask - 0.999).abs() < 1e-6 {
+                if (cosine - 1e-3).abs() < 1e-5 || (covered - 0.999).abs() < 1e-6 {
                     continue;
                 }
                 assert_eq!(kernel.is_hit(i), twin.is_hit(i), "{}: pixel {i}, cosine {cosine}", pool.name);
@@ -267,7 +274,7 @@ fn rays_at_the_surface_match_the_twin() {
                 let off = (kernel.share[i] - twin.share[i]).abs();
                 assert!(off < 1e-5, "{}: pixel {i}: F is {off} off", pool.name);
             }
-            let share = hits as f64 / masks.len() as f64;
+            let share = hits as f64 / cover.len() as f64;
             assert!(if pool.name == "flat" { (0.2..0.8).contains(&share) } else { share > 0.9 }, "{share}");
         }
     }
@@ -456,7 +463,7 @@ fn pictures_are_near_those_of_a_per_hit_tracer() {
         let view = &seen.views[2];
         let model = Gaussians64::from(&view.scene.model);
         let disks = project_seen(&model, &pool.camera, &pool.sights()[2], 0, &RasterRules::HARD);
-        let rays = surface_rays(&pool.water, &pool.camera, &pool.pose, &seen.masks());
+        let rays = surface_rays(&pool.water, &pool.camera, &pool.pose, &seen.cover());
         let (size, background) = ([pool.camera.width, pool.camera.height], view.scene.background64());
         let lists = intersect(&bounds_of(&disks), size[0], size[1]);
         let ordered = trace_forward(&disks, &lists, &rays.refracted, size, background, &RasterRules::HARD);

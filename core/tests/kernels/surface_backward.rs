@@ -162,6 +162,7 @@ fn gradients_of_the_composition_match_the_twin() {
                     close(&what, reflected[i][c].into(), twin.reflected[i][c], 3e-5);
                     close(&what, refracted[i][c].into(), twin.refracted[i][c], 3e-5);
                 }
+                close(&what, straight[i][3].into(), twin.alpha[i], 1e-5);
                 close(&what, mask[i].into(), twin.mask[i], 1e-5);
                 close(&what, share[i].into(), twin.share[i], 3e-5);
                 for (kernel, v, set) in [(&reflected, &twin.reflected, 1), (&refracted, &twin.refracted, 2)] {

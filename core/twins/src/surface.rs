@@ -1,11 +1,15 @@
 //! Scenes seen through a calm water surface (WSGS): three sets of disks and a plane.
 //!
-//! The first set is seen straight; its blended mask R is 1 where a pixel shows the scene above water. The
-//! second is seen in rays that the surface reflects, the third in rays that it refracts:
+//! The first set is seen straight, the second in rays that the surface reflects, the third in rays that it
+//! refracts:
 //!
 //! ```text
-//! c = R c_straight + (1 - R) shown(F light(c_reflected) + (1 - F) light(c_refracted))    (eq. 11, 12)
+//! water = shown(F light(c_reflected) + (1 - F) light(c_refracted))    (eq. 11)
+//! c = c_straight + (1 - alpha_straight) water                         over
+//! c = R c_straight + (1 - R) water                                    masked (eq. 12)
 //! ```
+//!
+//! R is the blended mask of the straight set: 1 where a pixel shows the scene above water.
 //!
 //! F is the reflectance, by Fresnel or by Schlick (eq. 10). `light` decodes sRGB and `shown` encodes it,
 //! unless the light is added as it is shown.
@@ -30,7 +34,7 @@ pub use sight::Sight;
 
 /// Least cosine with the normal of a ray that meets the surface.
 const LEAST_COSINE: f64 = 1e-3;
-/// From this blended mask on, a pixel shows nothing but the scene above water.
+/// From this R or alpha on, a pixel shows nothing but the scene above water.
 const DRY: f64 = 0.999;
 /// Least cosine with the normal of a ray that says something about the plane.
 const LEAST_STEEP: f64 = 0.1;
@@ -44,9 +48,16 @@ pub struct WaterSurface {
     pub schlick: bool,
     /// Reflected and refracted light add in sRGB, in place of linear light.
     pub as_shown: bool,
+    /// The straight picture lies over that of the water, in place of its masks.
+    pub over: bool,
 }
 
 impl WaterSurface {
+    /// By how much the straight picture covers the water, `[H*W]`: its alpha, or R.
+    pub fn cover<'a>(&self, straight: &'a DiskRaster) -> &'a [f64] {
+        if self.over { &straight.raster.alpha } else { &straight.mask }
+    }
+
     /// Share of the light that is reflected.
     pub fn reflectance(&self, cos_i: f64) -> f64 {
         if self.schlick { schlick(cos_i, AIR, self.plane.ior) } else { fresnel(cos_i, AIR, self.plane.ior) }
@@ -93,15 +104,15 @@ fn direction(camera: &PinholeCamera, pose: &Pose, pixel: usize) -> DVec3 {
 }
 
 /// The rays at the surface of all pixels but those that show the scene above water, or see the surface from
-/// nearly its edge. `masks` is R.
-pub fn surface_rays(water: &WaterSurface, camera: &PinholeCamera, pose: &Pose, masks: &[f64]) -> SurfaceRays {
+/// nearly its edge. `cover` is [`WaterSurface::cover`].
+pub fn surface_rays(water: &WaterSurface, camera: &PinholeCamera, pose: &Pose, cover: &[f64]) -> SurfaceRays {
     let (plane, eye) = (&water.plane, pose.centre());
     let (mirrored, straight) = (Sight::reflected(pose, plane), Sight::straight(pose));
     let mut rays = SurfaceRays::default();
-    for (pixel, mask) in masks.iter().enumerate() {
+    for (pixel, cover) in cover.iter().enumerate() {
         let d = direction(camera, pose, pixel);
         let cos_i = -plane.normal.dot(d);
-        let range = plane.meets(eye, d).filter(|_| cos_i > LEAST_COSINE && *mask < DRY);
+        let range = plane.meets(eye, d).filter(|_| cos_i > LEAST_COSINE && *cover < DRY);
         let [reflected, refracted] = range.map_or([DiskRay::NONE; 2], |range| {
             let (at, split) = (eye + range * d, plane.split(d));
             let seen = |sight: &Sight, along: DVec3| DiskRay {
@@ -134,6 +145,8 @@ pub struct Pictures<'a> {
 pub struct PictureGradients {
     /// With respect to the colours of the straight picture.
     pub straight: Vec<[f64; 3]>,
+    /// With respect to its alpha.
+    pub alpha: Vec<f64>,
     /// With respect to its blended mask.
     pub mask: Vec<f64>,
     /// With respect to the colours of the reflected picture.
@@ -151,11 +164,12 @@ pub fn compose(water: &WaterSurface, rays: &SurfaceRays, of: Pictures<'_>) -> Ve
         if !rays.is_hit(i) {
             return straight;
         }
-        let (dry, share) = (of.straight.mask[i], rays.share[i]);
+        let (dry, share) = (water.cover(of.straight)[i], rays.share[i]);
+        let worth = if water.over { 1.0 } else { dry };
         std::array::from_fn(|c| {
             let light = share * water.light(of.reflected.rgb[i][c]).0
                 + (1.0 - share) * water.light(of.refracted.rgb[i][c]).0;
-            (1.0 - dry) * water.shown(light).0 + dry * straight[c]
+            (1.0 - dry) * water.shown(light).0 + worth * straight[c]
         })
     };
     (0..rays.share.len()).map(pixel).collect()
@@ -171,20 +185,25 @@ pub fn compose_backward(
     let pixels = v.len();
     let mut out = PictureGradients {
         straight: v.to_vec(),
+        alpha: vec![0.0; pixels],
         mask: vec![0.0; pixels],
         reflected: vec![[0.0; 3]; pixels],
         refracted: vec![[0.0; 3]; pixels],
         share: vec![0.0; pixels],
     };
     for i in (0..pixels).filter(|&i| rays.is_hit(i)) {
-        let (dry, share) = (of.straight.mask[i], rays.share[i]);
+        let (dry, share) = (water.cover(of.straight)[i], rays.share[i]);
         for c in 0..3 {
             let (up, up_slope) = water.light(of.reflected.rgb[i][c]);
             let (down, down_slope) = water.light(of.refracted.rgb[i][c]);
             let (shown, slope) = water.shown(share * up + (1.0 - share) * down);
             let v_light = (1.0 - dry) * v[i][c] * slope;
-            out.straight[i][c] = dry * v[i][c];
-            out.mask[i] += v[i][c] * (of.straight.raster.rgb[i][c] - shown);
+            if water.over {
+                out.alpha[i] -= v[i][c] * shown;
+            } else {
+                out.straight[i][c] = dry * v[i][c];
+                out.mask[i] += v[i][c] * (of.straight.raster.rgb[i][c] - shown);
+            }
             out.reflected[i][c] = share * v_light * up_slope;
             out.refracted[i][c] = (1.0 - share) * v_light * down_slope;
             out.share[i] += v_light * (up - down);

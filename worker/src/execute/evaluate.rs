@@ -92,10 +92,9 @@ pub fn run(
             Some(renderer) => renderer.render(&view.camera, &view.pose)?,
             None => shown(Output::Underwater)?,
         };
-        if through_surface.is_some() {
-            // The scene without the surface.
-            parts.push(picture(&shown(Output::Underwater)?));
-        }
+        // The scene without the surface: what covers a pixel is seen straight there.
+        let dry = if through_surface.is_some() { Some(shown(Output::Underwater)?) } else { None };
+        parts.extend(dry.as_ref().map(picture));
         let render = picture(&seen);
         if let Some(gains) = gains {
             let mut rendered = shown(Output::Restored)?;
@@ -107,8 +106,8 @@ pub fn run(
             index: task.common.views[index],
             camera: &view.camera,
             pose: &view.pose,
-            alpha: &seen.alpha,
-            range: &seen.range,
+            alpha: &dry.as_ref().unwrap_or(&seen).alpha,
+            range: &dry.as_ref().unwrap_or(&seen).range,
             photograph: &truth,
             clear: clear.as_ref(),
             truth: None,

@@ -23,7 +23,7 @@ use glam::DVec3;
 use prost::Message;
 
 use super::partition::{Inside, OwnPart, own_part};
-use super::training::{Parts, Span, advance, finish, go_on, open, output_of, train};
+use super::training::{Parts, Span, advance, finish, go_on, open, output_of_shared, train};
 use super::{Control, TaskError, TaskInput, TaskOutput};
 use crate::blobs::to_proto;
 
@@ -105,7 +105,7 @@ pub fn run_rest(
         Restored::Run(trainer) => *trainer,
         Restored::Nothing => {
             tracing::warn!("no trained Gaussian lies in the cell of this partition");
-            return output_of(&own.parts.shared, &own.config, water.as_ref(), 0, Vec::new());
+            return output_of_shared(&own.parts.shared, &own.config, water.as_ref());
         }
         // The checkpoint cannot be used, so train the whole run with the consensus water, as if it had been
         // known from the start.

@@ -11,6 +11,7 @@ use std::sync::Arc;
 use fathom_core::Result;
 use fathom_core::gpu::{Rendered, Renderer};
 use fathom_core::seams::SURFACE_ALPHA;
+use fathom_core::surface::Surface;
 use fathom_core::views::{PackedImage, RayMap, TrainView, ViewSource};
 use glam::DVec3;
 
@@ -19,16 +20,18 @@ use glam::DVec3;
 const LEAST_SHARE: f64 = 0.03;
 
 /// The surface point of each pixel, row-major, in world axes: the point of its ray at the expected range.
-/// `None` if there is no surface.
+/// `None` if there is no surface. `rendered` shows the scene without `water`, through which the camera looks.
 pub fn surfaces<'a>(
     rendered: &'a Rendered,
     view: &'a TrainView,
+    water: Option<&'a Surface>,
 ) -> impl Iterator<Item = Option<DVec3>> + use<'a> {
     let camera = &view.camera;
     let (to_world, centre) = (view.pose.rotation.inverse(), view.pose.centre());
     rendered.alpha.iter().zip(&rendered.range).enumerate().map(move |(index, (&alpha, &range))| {
         (alpha >= SURFACE_ALPHA && range > 0.0)
             .then(|| centre + to_world * camera.direction(index) * f64::from(range / alpha))
+            .map(|point| water.map_or(point, |water| water.seen_instead(centre, point)))
     })
 }
 
@@ -36,9 +39,14 @@ pub fn surfaces<'a>(
 struct Mask(Vec<u64>);
 
 impl Mask {
-    fn of(rendered: &Rendered, view: &TrainView, inside: impl Fn(DVec3) -> bool) -> Self {
+    fn of(
+        rendered: &Rendered,
+        view: &TrainView,
+        water: Option<&Surface>,
+        inside: impl Fn(DVec3) -> bool,
+    ) -> Self {
         let mut bits = vec![0; rendered.alpha.len().div_ceil(64)];
-        for (index, surface) in surfaces(rendered, view).enumerate() {
+        for (index, surface) in surfaces(rendered, view, water).enumerate() {
             bits[index / 64] |= u64::from(surface.is_none_or(&inside)) << (index % 64);
         }
         Self(bits)
@@ -66,19 +74,21 @@ pub struct LossMask {
 }
 
 impl LossMask {
-    /// Renders every view and keeps the pixels whose surface is `inside`. Calls `go_on` between views and
+    /// Renders every view and keeps the pixels whose surface is `inside`, through the surface of `water` if
+    /// there is one. Calls `go_on` between views and
     /// returns `None` once it returns false. If no view shows the region, all pixels are kept.
     ///
     /// # Errors
     /// When the device fails.
     pub fn new(
         renderer: Renderer,
+        water: Option<&Surface>,
         source: Arc<dyn ViewSource>,
         inside: impl Fn(DVec3) -> bool,
         go_on: impl Fn() -> bool,
     ) -> Result<Option<Self>> {
         let shown = |mask: &Mask, _: &Rendered, _: &TrainView| mask.counted() as usize;
-        let own = Self::choose(renderer, source, inside, shown, go_on)?;
+        let own = Self::choose(renderer, water, source, inside, shown, go_on)?;
         Ok(own.map(|own| if own.kept.is_empty() { Self::all_of(own.source) } else { own }))
     }
 
@@ -90,19 +100,21 @@ impl LossMask {
     pub fn showing(
         what: impl Fn(DVec3) -> bool,
         renderer: Renderer,
+        water: Option<&Surface>,
         source: Arc<dyn ViewSource>,
         inside: impl Fn(DVec3) -> bool,
         go_on: impl Fn() -> bool,
     ) -> Result<Option<Self>> {
         let shown = |_: &Mask, rendered: &Rendered, view: &TrainView| {
-            surfaces(rendered, view).filter(|surface| surface.is_some_and(&what)).count()
+            surfaces(rendered, view, water).filter(|surface| surface.is_some_and(&what)).count()
         };
-        Self::choose(renderer, source, inside, shown, go_on)
+        Self::choose(renderer, water, source, inside, shown, go_on)
     }
 
     /// The views in which `shown` counts enough pixels, without the pixels whose surface is not `inside`.
     fn choose(
         mut renderer: Renderer,
+        water: Option<&Surface>,
         source: Arc<dyn ViewSource>,
         inside: impl Fn(DVec3) -> bool,
         shown: impl Fn(&Mask, &Rendered, &TrainView) -> usize,
@@ -114,7 +126,7 @@ impl LossMask {
                 return Ok(None);
             }
             let rendered = renderer.render(&view.camera, &view.pose, [0.0; 3])?;
-            let mask = Mask::of(&rendered, view, &inside);
+            let mask = Mask::of(&rendered, view, water, &inside);
             let pixels = rendered.alpha.len();
             if shown(&mask, &rendered, view) as f64 >= LEAST_SHARE * pixels as f64 {
                 kept.push((index, (mask.counted() as usize != pixels).then_some(mask)));
@@ -206,7 +218,7 @@ mod tests {
             Arc::new(InMemory { views, images: (0..3).map(|index| Arc::new(numbered(index))).collect() });
         let renderer = || Renderer::new(Arc::clone(&gpu), &wall_of_gaussians()).unwrap();
         let masks = |inside: fn(DVec3) -> bool| {
-            LossMask::new(renderer(), Arc::clone(&source), inside, || true).unwrap().unwrap()
+            LossMask::new(renderer(), None, Arc::clone(&source), inside, || true).unwrap().unwrap()
         };
 
         let right = masks(|point| point.x > 0.0);
@@ -229,14 +241,16 @@ mod tests {
         // Views of the strip beside the border learn from everything right of it.
         let strip = |point: DVec3| point.x > 0.0 && point.x < 1.0;
         let showing = |what: fn(DVec3) -> bool| {
-            LossMask::showing(what, renderer(), Arc::clone(&source), |p| p.x > 0.0, || true).unwrap().unwrap()
+            LossMask::showing(what, renderer(), None, Arc::clone(&source), |p| p.x > 0.0, || true)
+                .unwrap()
+                .unwrap()
         };
         let beside = showing(strip);
         assert_eq!(beside.views().iter().map(|view| view.name.as_str()).collect::<Vec<_>>(), ["middle"]);
         assert_eq!(beside.load(0).unwrap().pixels, middle.pixels);
         assert!(showing(|_| false).views().is_empty(), "a view shows nothing of it");
 
-        let stopped = LossMask::new(renderer(), source, |_| true, || false).unwrap();
+        let stopped = LossMask::new(renderer(), None, source, |_| true, || false).unwrap();
         assert!(stopped.is_none(), "it did not stop when asked to");
     }
 
@@ -244,7 +258,7 @@ mod tests {
     fn a_pixel_counts_where_the_surface_behind_it_is_inside() {
         for alpha in [1.0, 0.6] {
             // The pixels look at x = -7.5, -2.5, 2.5 and 7.5 on the wall.
-            let mask = Mask::of(&wall(alpha), &view(), |point| {
+            let mask = Mask::of(&wall(alpha), &view(), None, |point| {
                 assert!((point.z - 10.0).abs() < 1e-5, "{point}");
                 point.x < 0.0 && point.x > -5.0
             });
@@ -253,13 +267,13 @@ mod tests {
         let turned =
             TrainView { pose: Pose::looking_at([3.0, 0.0, 0.0].into(), DVec3::X * 9.0, DVec3::Y), ..view() };
         // Now the camera is at x = 3 and looks along x: picture x is world -z.
-        let mask = Mask::of(&wall(1.0), &turned, |p| (p.x - 13.0).abs() < 1e-5 && p.z < 0.0);
+        let mask = Mask::of(&wall(1.0), &turned, None, |p| (p.x - 13.0).abs() < 1e-5 && p.z < 0.0);
         assert_eq!(mask.0, [0b1100]);
     }
 
     #[test]
     fn open_water_counts() {
-        assert_eq!(Mask::of(&wall(0.4), &view(), |_| false).0, [0b1111]);
+        assert_eq!(Mask::of(&wall(0.4), &view(), None, |_| false).0, [0b1111]);
     }
 
     #[test]

@@ -3,12 +3,15 @@
 //! A job of one partition has no coarse model and trains everything from the sparse points. If partitions
 //! have two parts (`first_part.rs`), this is the second part.
 
+use std::path::Path;
 use std::sync::Arc;
 
 use fathom_core::config::TrainConfig;
 use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::{Gpu, Renderer};
 use fathom_core::ply;
+use fathom_core::surface::Surface;
+use fathom_core::train::surface::surface_part;
 use fathom_core::train::{MediumRun, clear_points, surface_points};
 use fathom_core::views::ViewSource;
 use fathom_proto::worker::v1::{Artifact, FailClass, FocusBox, PartitionSpec};
@@ -16,7 +19,9 @@ use glam::{DQuat, DVec3};
 
 use super::first_part::{read_exchange, run_rest};
 use super::loss_mask::LossMask;
-use super::training::{Parts, Span, output_of, parts_of_points, read_points, train, under_water};
+use super::training::{
+    Parts, Span, Unchanged, output_of_shared, parts_of_points, read_points, train, under_water,
+};
 use super::{Control, TaskError, TaskInput, TaskOutput};
 
 pub fn run(
@@ -34,7 +39,7 @@ pub fn run(
     if own.parts.focus.is_empty() {
         let agreed = exchange.and_then(|exchange| exchange.water);
         let water = agreed.map(|agreed| agreed.water).or(own.parts.water);
-        return output_of(&own.parts.shared, &task.config.train, water.as_ref(), 0, Vec::new());
+        return output_of_shared(&own.parts.shared, &task.config.train, water.as_ref());
     }
     match exchange {
         Some(exchange) => run_rest(gpu, task, spec, own, exchange, control),
@@ -70,9 +75,12 @@ pub fn own_part(
             return Err(TaskError::Failed { class: FailClass::Input, message });
         }
     };
+    let inside = Inside::new(bounds)?;
+    if task.config.method.through_surface() {
+        return own_sets(gpu, task, model, &inside, views, control).map(Some);
+    }
     let water = ply::water_record(model)?;
     let model = ply::read_model(model)?;
-    let inside = Inside::new(bounds)?;
     let (own, mut context) = model.split_by(|mean| inside.contains(DVec3::from(mean.map(f64::from))));
     let solid = model.surfaces(task.common.viewing_distance);
     let (shared, focus) = split_shared(&own, task.common.viewing_distance);
@@ -88,18 +96,73 @@ pub fn own_part(
         }
     };
     let views = under_water(task, medium.as_ref(), views)?;
+    if focus.is_empty() {
+        tracing::warn!(shared = shared.len(), "this partition has nothing to train");
+    }
+    let shared = Unchanged::Gaussians(shared);
     let parts = Parts { focus, context, surfaces, shared, medium, water, surface: None };
     if parts.focus.is_empty() {
-        tracing::warn!(shared = parts.shared.len(), "this partition has nothing to train");
         return Ok(Some(OwnPart { parts, views, config }));
     }
+    let views = own_pixels(gpu, task, &solid, None, &inside, views, control)?;
+    Ok(Some(OwnPart { parts, views, config }))
+}
+
+/// How much wider Gaussians that no partition trains are in air: there is no haze, and what is wide is what a
+/// hall or a far bank consists of. A pool of 4 m in 2x2 reached 29.03 dB with this, and 28.86 dB with 1 (one
+/// seed).
+const IN_AIR: f32 = 4.0;
+
+/// As [`own_part`], of a scene with a water surface: every set has its part in the box.
+fn own_sets(
+    gpu: &Arc<Gpu>,
+    task: &TaskInput,
+    path: &Path,
+    inside: &Inside<'_>,
+    views: Arc<dyn ViewSource>,
+    control: &dyn Control,
+) -> Result<OwnPart, TaskError> {
+    let Some(model) = ply::read_surface_model(path)? else {
+        let message = "the coarse model has no water surface".to_owned();
+        return Err(TaskError::Failed { class: FailClass::Input, message });
+    };
+    let surface = model.record.surface();
+    let distance = task.common.viewing_distance.map(|distance| IN_AIR * distance);
+    let solid = model.dry().surfaces(distance);
+    let (own, mut rest) = model.split_by(|mean| inside.contains(DVec3::from(mean.map(f64::from))));
+    let (shared, focus) = own.split_where(|set, index| set.is_wide(index, distance));
+    rest.append(&shared);
+    let config = task.train_config().continued();
+    let shared_count = shared.len();
+    let shared = Unchanged::Sets(Box::new(shared));
+    if focus.is_empty() {
+        tracing::warn!(shared = shared_count, "this partition has nothing to train");
+        let nothing = Parts::only(Gaussians::empty(config.sh_degree));
+        return Ok(OwnPart { parts: Parts { shared, ..nothing }, views, config });
+    }
+    let ([focus, context], run) = surface_part(focus, rest, &task.config.surface);
+    let parts = Parts { context, shared, surface: Some(run), ..Parts::only(focus) };
+    let views = own_pixels(gpu, task, &solid, Some(&surface), inside, views, control)?;
+    Ok(OwnPart { parts, views, config })
+}
+
+/// The views, with only those pixels that show the box. `solid` is the model without Gaussians that are no
+/// surface: haze would move surfaces towards the camera, and background Gaussians would end rays that meet
+/// none. `water` is the water surface that cameras look through.
+fn own_pixels(
+    gpu: &Arc<Gpu>,
+    task: &TaskInput,
+    solid: &Gaussians,
+    water: Option<&Surface>,
+    inside: &Inside<'_>,
+    views: Arc<dyn ViewSource>,
+    control: &dyn Control,
+) -> Result<Arc<dyn ViewSource>, TaskError> {
     let go_on = || control.stop_reason().is_none();
-    // Haze would move the surface towards the camera, and background Gaussians would end rays that meet no
-    // surface.
-    let renderer = Renderer::new(Arc::clone(gpu), &solid)?.drawn(task.config.train.drawing())?;
-    let views = LossMask::new(renderer, views, |point| inside.contains(point), go_on)?;
+    let renderer = Renderer::new(Arc::clone(gpu), solid)?.drawn(task.config.train.drawing())?;
+    let views = LossMask::new(renderer, water, views, |point| inside.contains(point), go_on)?;
     let Some(views) = views else { return Err(TaskError::Stopped { checkpoint: None }) };
-    Ok(Some(OwnPart { parts, views: Arc::new(views), config }))
+    Ok(Arc::new(views))
 }
 
 /// Splits a model into shared Gaussians, so large that many partitions see them (haze and background), and

@@ -64,8 +64,8 @@ pub fn parts_of_points(
     let views = &views;
     let (points, config) = (read_points(task)?, task.train_config());
     if task.config.method.through_surface() {
-        let focus = initial_gaussians(&points, views.views(), &config, None)?;
-        let surface = surface_run(&points, views.views(), &task.common.views, &config, &task.config.surface)?;
+        let (focus, surface) =
+            surface_run(&points, views.views(), &task.common.views, &config, &task.config.surface)?;
         return Ok((Parts { surface: Some(surface), ..Parts::only(focus) }, Arc::clone(views)));
     }
     let full = task.full_views(views)?;
@@ -90,13 +90,21 @@ pub struct Parts {
     /// For each place that must stay covered, a Gaussian that covers it.
     pub surfaces: Gaussians,
     /// The part of the context that is submitted with the result.
-    pub shared: Gaussians,
+    pub shared: Unchanged,
     /// The medium between cameras and scene.
     pub medium: Option<MediumRun>,
     /// The shared water as recorded in the coarse model.
     pub water: Option<WaterRecord>,
     /// The water surface that cameras look through.
     pub surface: Option<SurfaceRun>,
+}
+
+/// What a partition submits as the coarse model has it.
+pub enum Unchanged {
+    /// Of a scene without a water surface.
+    Gaussians(Gaussians),
+    /// Of one with it.
+    Sets(Box<SurfaceModel>),
 }
 
 impl Parts {
@@ -107,7 +115,7 @@ impl Parts {
             focus,
             context: none.clone(),
             surfaces: none.clone(),
-            shared: none,
+            shared: Unchanged::Gaussians(none),
             medium: None,
             water: None,
             surface: None,
@@ -171,27 +179,52 @@ pub fn finish(
     task: &TaskInput,
     run: &mut dyn Run,
     config: &TrainConfig,
-    shared: &Gaussians,
+    shared: &Unchanged,
     water: Option<WaterRecord>,
     resumed_from: u32,
     history: Vec<v1::HeldOutMetrics>,
 ) -> Result<TaskOutput, TaskError> {
     let mut trained = run.hand_in(task.config.data.metres_per_unit)?;
-    (0..shared.len()).for_each(|index| trained.gaussians.push_from(shared, index));
     if trained.skipped_steps > 0 {
         tracing::warn!(
             skipped = trained.skipped_steps,
             "steps of the water, or of its surface, were skipped: their gradients were not finite"
         );
     }
-    if let Some(model) = &trained.surface {
-        let model = in_order(model);
-        let result = Bytes::from(ply::surface_to_bytes(&model, &[])?);
-        let gaussians = model.len() as u32;
-        return Ok(TaskOutput { result, gaussians, resumed_from, held_out: history, further: Vec::new() });
+    if let Some(mut model) = trained.surface {
+        if let Unchanged::Sets(sets) = shared {
+            model.append(sets);
+        }
+        return output_of_sets(&model, resumed_from, history);
+    }
+    if let Unchanged::Gaussians(shared) = shared {
+        (0..shared.len()).for_each(|index| trained.gaussians.push_from(shared, index));
     }
     let water = water.or(trained.water);
     output_of(&trained.gaussians, config, water.as_ref(), resumed_from, history)
+}
+
+/// What a partition with nothing to train submits.
+pub fn output_of_shared(
+    shared: &Unchanged,
+    config: &TrainConfig,
+    water: Option<&WaterRecord>,
+) -> Result<TaskOutput, TaskError> {
+    match shared {
+        Unchanged::Gaussians(shared) => output_of(shared, config, water, 0, Vec::new()),
+        Unchanged::Sets(shared) => output_of_sets(shared, 0, Vec::new()),
+    }
+}
+
+/// As `output_of`, of a scene with a water surface.
+fn output_of_sets(
+    model: &SurfaceModel,
+    resumed_from: u32,
+    held_out: Vec<v1::HeldOutMetrics>,
+) -> Result<TaskOutput, TaskError> {
+    let model = in_order(model);
+    let result = Bytes::from(ply::surface_to_bytes(&model, &[])?);
+    Ok(TaskOutput { result, gaussians: model.len() as u32, resumed_from, held_out, further: Vec::new() })
 }
 
 /// A scene with a water surface whose sets are sorted as `output_of` sorts.

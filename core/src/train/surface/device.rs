@@ -141,7 +141,7 @@ impl DeviceSurface {
             .map(|(v_pixels, v_rays)| super::super::TracedBuffers { v_pixels, v_rays })
     }
 
-    /// Records the rays at the surface, from the blended masks of the straight picture.
+    /// Records the rays at the surface, of pixels that the straight picture does not cover.
     ///
     /// # Errors
     /// When a kernel does not compile or a frame is not what it should be.
@@ -153,6 +153,7 @@ impl DeviceSurface {
             &[
                 ("frame", &frames.straight.uniform),
                 ("surface", &self.plane),
+                ("image", &frames.straight.targets()?.image),
                 ("normal_image", masks_of(frames.straight)?),
                 ("reflected_rays", reflected),
                 ("refracted_rays", refracted),

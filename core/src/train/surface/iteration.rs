@@ -5,7 +5,7 @@ use std::sync::Arc;
 use super::device::{Frames, SetGradients, record_agreement};
 use super::{SurfaceTrainer, share_of};
 use crate::Result;
-use crate::config::SurfaceRefine;
+use crate::config::{SurfaceJoin, SurfaceRefine};
 use crate::gpu::{FrameUniform, Gpu, MaskLossUniform, Recorder, StepUniform, SurfaceStepUniform};
 use crate::memory::BATCH;
 use crate::train::{BackwardBuffers, DiskMaps, Progress, Trainer, record_backward, record_backward_in_bands};
@@ -67,7 +67,7 @@ impl SurfaceTrainer {
     /// What is due at the start of this iteration, besides density control. Doing it twice changes nothing.
     fn decide(&mut self) -> Result<()> {
         let at = self.iteration;
-        if at < self.from {
+        if at < self.from || self.config.join == SurfaceJoin::Over {
             return Ok(());
         }
         if self.masks.made_at() != Some(at) && self.mask_times().any(|time| time == at) {
@@ -176,7 +176,8 @@ impl SurfaceTrainer {
         }
 
         // Forward.
-        let straight = begin(&mut self.straight, gpu, recorder, key, &whole, progress, self.config.mask_lr)?;
+        let mask_lr = if self.config.join == SurfaceJoin::Over { 0.0 } else { self.config.mask_lr };
+        let straight = begin(&mut self.straight, gpu, recorder, key, &whole, progress, mask_lr)?;
         let mut sides = Vec::new();
         if all {
             for set in [&mut self.reflected, &mut self.refracted] {

@@ -1,12 +1,14 @@
 //! Training of a scene that is seen through a water surface (WSGS).
 //!
-//! Three sets of disks make a picture. The straight set is the scene above water; each of its disks has a
-//! mask that says whether it belongs there. The reflected set is what the surface mirrors, and the refracted
-//! set is what lies in the water. Each set is a [`Trainer`] of its own, with its lists, its optimiser and its
-//! density control. This module only forms the picture from theirs, and hands gradients back.
+//! Three sets of disks make a picture. The straight set is the scene above water, the reflected set is what
+//! the surface mirrors, and the refracted set is what lies in the water. Each set is a [`Trainer`] of its
+//! own, with its lists, its optimiser and its density control. This module only forms the picture from
+//! theirs, and hands gradients back.
 //!
-//! At first the straight set is trained alone, as in the paper. From [`SurfaceConfig::from`] on all three
-//! are. Where refracted light explains a pixel, the mask of the straight disks below the surface fades.
+//! The straight picture lies over that of the water. With [`SurfaceJoin::Masked`], as in the paper, each
+//! straight disk has a mask that says whether it belongs above water. At first the straight set is then
+//! trained alone, from all points. From [`SurfaceConfig::from`] on all sets are. Where refracted light
+//! explains a pixel, the mask of the straight disks below the surface fades.
 
 mod device;
 mod iteration;
@@ -19,10 +21,12 @@ use std::sync::Arc;
 use glam::DVec3;
 
 pub use device::{DeviceSurface, Frames, SetGradients, record_agreement};
-pub use start::surface_run;
+pub use start::{surface_part, surface_run};
 
 use super::{HeldOutMetrics, Part, Preview, Progress, TrainRun, Trainer};
-use crate::config::{Reflectance, Strategy, SurfaceConfig, SurfaceLight, TrainConfig};
+use crate::config::{
+    Reflectance, Strategy, SurfaceConfig, SurfaceJoin, SurfaceLight, SurfaceRefine, TrainConfig,
+};
 use crate::gaussians::Gaussians;
 use crate::gpu::{Gpu, ListLimits, SurfaceRays, SurfaceRenderer, SurfaceUniform};
 use crate::scene::{PinholeCamera, Pose};
@@ -42,6 +46,9 @@ pub struct SurfaceRun {
     pub reflected: Gaussians,
     /// Disks below it.
     pub refracted: Gaussians,
+    /// Disks of both that are seen but not trained: reflected, refracted. Those above water are in
+    /// [`TrainRun::context`].
+    pub context: [Gaussians; 2],
     /// How it is trained.
     pub config: SurfaceConfig,
 }
@@ -54,6 +61,8 @@ pub struct SurfaceTrainer {
     device: DeviceSurface,
     config: SurfaceConfig,
     record: SurfaceRecord,
+    /// What is seen but not trained.
+    context: SurfaceModel,
     /// First iteration of all three sets.
     from: u32,
     masks: PseudoMasks,
@@ -70,7 +79,7 @@ pub fn uniform_of(record: &SurfaceRecord) -> SurfaceUniform {
         eta: (AIR / surface.ior) as f32,
         schlick: u32::from(record.reflectance == Reflectance::Schlick),
         as_shown: u32::from(record.light == SurfaceLight::Srgb),
-        pad: 0.0,
+        over: u32::from(record.join == SurfaceJoin::Over),
     }
 }
 
@@ -89,12 +98,19 @@ impl SurfaceTrainer {
                 "method wsgs needs train.strategy = \"mcmc\", disks, and no water.medium".into(),
             ));
         }
-        let SurfaceRun { record, pivot, reflected, refracted, config } = surface;
+        let SurfaceRun { record, pivot, reflected, refracted, context, config } = surface;
+        let context = SurfaceModel {
+            masks: vec![SHOWN; run.context.len()],
+            straight: run.context.clone(),
+            reflected: context[0].clone(),
+            refracted: context[1].clone(),
+            record: record.clone(),
+        };
         let iterations = run.config.iterations;
         let from = share_of(iterations, config.from).min(iterations);
         let device = DeviceSurface::new(&gpu, uniform_of(&record), pivot.as_vec3().to_array())?;
         let caps = caps(run.config.max_gaussians, config.shares);
-        let side = |focus: Gaussians, cap: u32, seed: u32, own: TrainConfig| TrainRun {
+        let side = |[focus, context]: [Gaussians; 2], cap: u32, seed: u32, own: TrainConfig| TrainRun {
             config: TrainConfig {
                 max_gaussians: cap,
                 iterations: (iterations - from).max(1),
@@ -106,21 +122,22 @@ impl SurfaceTrainer {
             extent: run.extent,
             views: Arc::clone(&run.views),
             focus,
-            context: Gaussians::empty(run.config.sh_degree),
+            context,
             surfaces: Gaussians::empty(run.config.sh_degree),
             medium: None,
             surface: None,
         };
         let part = |rays| Part::AtSurface(rays, device.plane());
         let [reflected, refracted] = [
-            side(reflected, caps[2], 1, of_reflections(&run.config)),
-            side(refracted, caps[1], 2, run.config.clone()),
+            side([reflected, context.reflected.clone()], caps[2], 1, of_reflections(&run.config)),
+            side([refracted, context.refracted.clone()], caps[1], 2, run.config.clone()),
         ];
         let reflected = Trainer::of_part(Arc::clone(&gpu), reflected, part(SurfaceRays::Reflected))?;
         let refracted = Trainer::of_part(Arc::clone(&gpu), refracted, part(SurfaceRays::Refracted))?;
         run.config.max_gaussians = caps[0];
-        // The logit of a mask of a half.
-        run.focus.log_scales.iter_mut().for_each(|scales| scales[2] = 0.0);
+        // The logit of a mask: of one that hides nothing, or of a half.
+        let mask = if config.join == SurfaceJoin::Over { SHOWN } else { 0.0 };
+        run.focus.log_scales.iter_mut().for_each(|scales| scales[2] = mask);
         let straight = Trainer::of_part(Arc::clone(&gpu), run, Part::Straight)?;
         let digest = state::digest(&config, &record, pivot, [&straight, &reflected, &refracted]);
         let masks = PseudoMasks::new(&gpu, straight.targets.views())?;
@@ -131,6 +148,7 @@ impl SurfaceTrainer {
             device,
             config,
             record,
+            context,
             from,
             masks,
             iteration: 0,
@@ -194,7 +212,7 @@ impl SurfaceTrainer {
         self.device.steps_left_out(&self.straight.gpu)
     }
 
-    /// What the run has trained so far.
+    /// What the run has trained so far, without the context.
     ///
     /// # Errors
     /// When the device fails.
@@ -204,14 +222,25 @@ impl SurfaceTrainer {
         let mut straight = self.straight.blocks.download(&gpu)?;
         let masks = straight.log_scales.iter().map(|scales| scales[2]).collect();
         straight.flatten();
-        let is_above = |mean: [f32; 3]| surface.height(DVec3::from(mean.map(f64::from))) > 0.0;
         Ok(SurfaceModel {
             straight,
             masks,
-            reflected: self.reflected.gaussians()?.split_by(is_above).0,
-            refracted: self.refracted.gaussians()?.split_by(is_above).1,
-            record: self.record.clone().at(&surface),
+            reflected: self.reflected.gaussians()?,
+            refracted: self.refracted.gaussians()?,
+            record: if self.config.refine == SurfaceRefine::Fixed {
+                // The same to the bit in every partition.
+                self.record.clone()
+            } else {
+                self.record.clone().at(&surface)
+            },
         })
+    }
+
+    /// What the run shows: what it has trained, and what it trains beside.
+    fn shown(&mut self) -> Result<SurfaceModel> {
+        let mut shown = self.model()?;
+        shown.append(&self.context);
+        Ok(shown)
     }
 
     /// As [`Trainer::measure`], of the picture with the surface.
@@ -223,7 +252,7 @@ impl SurfaceTrainer {
         held_out: &dyn ViewSource,
         go_on: impl Fn() -> bool,
     ) -> Result<Option<HeldOutMetrics>> {
-        let model = self.model()?;
+        let model = self.shown()?;
         let mut renderer = SurfaceRenderer::new(Arc::clone(&self.straight.gpu), &model)?;
         let iteration = self.iteration;
         let measured = super::held_out::measured(iteration, held_out, go_on, |camera, pose| {
@@ -243,7 +272,7 @@ impl SurfaceTrainer {
         cameras: &[(PinholeCamera, Pose)],
         go_on: impl Fn() -> bool,
     ) -> Result<Vec<Preview>> {
-        let model = self.model()?;
+        let model = self.shown()?;
         let gpu = Arc::clone(&self.straight.gpu);
         let mut renderer = SurfaceRenderer::new(Arc::clone(&gpu), &model)?;
         let mut dry = SurfaceRenderer::dry(Arc::clone(&gpu), &model)?;
@@ -296,6 +325,8 @@ impl SurfaceTrainer {
     }
 }
 
+/// Logit of the mask of a disk that shows in full.
+const SHOWN: f32 = 10.0;
 /// Factor on the rates of shapes and opacities of the reflected set.
 const SLOW: f32 = 0.1;
 
@@ -303,8 +334,9 @@ const SLOW: f32 = 0.1;
 ///
 /// The surface reflects a few percent of the light. The weights on opacity and scale assume gradients as
 /// large as those of the picture: with them, nothing of the set was left on a pool. Adam scales small
-/// gradients to full size, with their noise, so the set has no harmonics, and its shapes move slowly. That
-/// alone gained nothing yet (29.9 dB in the water with and without, one seed).
+/// gradients to full size, with their noise, so the set has no harmonics, and its shapes move slowly. A pool
+/// with masks came out the same without (29.9 dB in the water, one seed). The set is not what limits a pool:
+/// with the true refracted picture, the water would have 41 dB.
 fn of_reflections(config: &TrainConfig) -> TrainConfig {
     TrainConfig {
         sh_degree_at: [2.0; 3],
@@ -325,7 +357,8 @@ fn share_of(iterations: u32, share: f32) -> u32 {
 /// Caps of the straight, the refracted and the reflected set, at least one each.
 fn caps(total: u32, shares: [f32; 3]) -> [u32; 3] {
     let sum: f64 = shares.iter().map(|&share| f64::from(share)).sum();
-    let of = |share: f32| (f64::from(total) * f64::from(share) / sum.max(1e-9)) as u32;
+    // Rounded, so that shares which are numbers of disks give these numbers.
+    let of = |share: f32| (f64::from(total) * f64::from(share) / sum.max(1e-9)).round() as u32;
     let [_, refracted, reflected] = shares.map(of).map(|cap| cap.max(1));
     [total.saturating_sub(refracted + reflected).max(1), refracted, reflected]
 }

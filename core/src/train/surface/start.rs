@@ -4,12 +4,12 @@ use glam::DVec3;
 
 use super::SurfaceRun;
 use crate::Result;
-use crate::config::{SurfaceConfig, SurfaceStart, TrainConfig};
+use crate::config::{SurfaceConfig, SurfaceJoin, SurfaceRefine, SurfaceStart, TrainConfig};
 use crate::gaussians::{Gaussians, SH_C0};
 use crate::rng::{Stream, random_bits, uniform};
 use crate::scene::Points;
-use crate::surface::{Surface, SurfaceOptions, SurfaceRecord, SurfaceSource, surface_prior};
-use crate::train::init::{gaussians_from_points, limit, turn};
+use crate::surface::{Surface, SurfaceModel, SurfaceOptions, SurfaceRecord, SurfaceSource, surface_prior};
+use crate::train::init::{gaussians_from_points, initial_gaussians, initial_gaussians_within, limit, turn};
 use crate::views::TrainView;
 
 /// Opacity of a new disk of the refracted and the reflected set. The paper has 0.1; see
@@ -21,7 +21,8 @@ const DARK: f32 = 0.2;
 const NEAREST_DOME: f64 = 1.0;
 const FARTHEST_DOME: f64 = 2.5;
 
-/// The water surface of a run, found or given, and the starts of the sets that it shows.
+/// The start of a run: the scene above water, then the water surface, found or given, with the starts of the
+/// sets that it shows.
 ///
 /// `views` are the training views, and `scene_views` their numbers in the tracks of `points`.
 ///
@@ -34,7 +35,7 @@ pub fn surface_run(
     scene_views: &[u32],
     train: &TrainConfig,
     config: &SurfaceConfig,
-) -> Result<SurfaceRun> {
+) -> Result<(Gaussians, SurfaceRun)> {
     let options = SurfaceOptions {
         offset: config.offset,
         normal: config.normal.map(DVec3::from),
@@ -57,6 +58,7 @@ pub fn surface_run(
     let record = SurfaceRecord {
         reflectance: config.reflectance,
         light: config.light,
+        join: config.join,
         source: match config.start {
             _ if given => SurfaceSource::Given,
             SurfaceStart::Tracks => SurfaceSource::Tracks,
@@ -74,13 +76,72 @@ pub fn surface_run(
     } else {
         refracted_start(&wet, train, refracted)?
     };
-    Ok(SurfaceRun {
+    let straight = match config.join {
+        SurfaceJoin::Over => {
+            let is_above = |mean: [f32; 3]| surface.height(DVec3::from(mean.map(f64::from))) > 0.0;
+            let mut dry = prior.dry_points(points);
+            if config.start == SurfaceStart::Paper {
+                // Nothing says which points are in the water.
+                dry = dry.select(&above(&dry, is_above));
+            }
+            initial_gaussians_within(&dry, views, train, None, is_above)?
+        }
+        SurfaceJoin::Masked => initial_gaussians(points, views, train, None)?,
+    };
+    let none = || Gaussians::empty(train.sh_degree);
+    let run = SurfaceRun {
         record,
+        context: [none(), none()],
         pivot: prior.centre,
         reflected: dome_start(prior.centre, &eyes, &surface, train, reflected)?,
         refracted,
         config: config.clone(),
-    })
+    };
+    Ok((straight, run))
+}
+
+/// The start of a run that trains a part of a model beside the rest of it: its straight focus and context,
+/// and the surface, which stays where it is.
+///
+/// Each set gets the share of the cap that it has of the part. A set of which the part has nothing takes a
+/// disk of the context: it is trained, but lies elsewhere, so a merge drops it.
+pub fn surface_part(
+    mut part: SurfaceModel,
+    mut rest: SurfaceModel,
+    config: &SurfaceConfig,
+) -> ([Gaussians; 2], SurfaceRun) {
+    for (own, others) in [
+        (&mut part.straight, &mut rest.straight),
+        (&mut part.reflected, &mut rest.reflected),
+        (&mut part.refracted, &mut rest.refracted),
+    ] {
+        if own.is_empty() && !others.is_empty() {
+            (*own, *others) = others.split_where(|index| index == 0);
+        }
+    }
+    let sets = [&part.straight, &part.refracted, &part.reflected];
+    let config = SurfaceConfig {
+        shares: sets.map(|set| set.len().max(1) as f32),
+        refine: SurfaceRefine::Fixed,
+        from: 0.0,
+        ..config.clone()
+    };
+    let run = SurfaceRun {
+        // The plane does not turn.
+        pivot: DVec3::ZERO,
+        record: part.record,
+        reflected: part.reflected,
+        refracted: part.refracted,
+        context: [rest.reflected, rest.refracted],
+        config,
+    };
+    ([part.straight, rest.straight], run)
+}
+
+/// The numbers of the points for which `is_above` holds.
+fn above(points: &Points, is_above: impl Fn([f32; 3]) -> bool) -> Vec<u32> {
+    let numbers = (0..points.len() as u32).filter(|&index| is_above(points.positions[index as usize]));
+    numbers.collect()
 }
 
 /// The start of the refracted set: disks at the points in the water, where refraction puts them.
@@ -125,7 +186,7 @@ fn sunken_start(
 
 /// The start of the reflected set: `count` dark disks on a dome over the surface, facing its middle. The
 /// paper has them at random in the box of the points, most of which is air between surface and cameras. A
-/// pool came out the same from both (29.8 and 30.0 dB in its water, one seed).
+/// pool with masks came out the same from both (29.8 and 30.0 dB in its water, one seed).
 fn dome_start(
     pivot: DVec3,
     eyes: &[DVec3],
