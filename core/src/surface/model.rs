@@ -40,19 +40,26 @@ impl SurfaceModel {
 
     /// Splits every set by where its disks are.
     pub fn split_by(&self, mut is_first: impl FnMut([f32; 3]) -> bool) -> (Self, Self) {
-        self.split_where(|set, index| is_first(set.means[index]))
+        let sets = self.sets();
+        self.split_where(|set, index| is_first(sets[set].means[index]))
     }
 
-    /// Splits every set: `is_first` gets the set and the index of a disk in it.
-    pub fn split_where(&self, mut is_first: impl FnMut(&Gaussians, usize) -> bool) -> (Self, Self) {
+    /// The straight, the reflected and the refracted set.
+    pub fn sets(&self) -> [&Gaussians; 3] {
+        [&self.straight, &self.reflected, &self.refracted]
+    }
+
+    /// Splits every set: `is_first` gets the number of the set in [`SurfaceModel::sets`], and the index of a
+    /// disk in it.
+    pub fn split_where(&self, mut is_first: impl FnMut(usize, usize) -> bool) -> (Self, Self) {
         let mut masks = [Vec::new(), Vec::new()];
         let straight = self.straight.split_where(|index| {
-            let first = is_first(&self.straight, index);
+            let first = is_first(0, index);
             masks[usize::from(!first)].extend(self.masks.get(index));
             first
         });
-        let mut split = |set: &Gaussians| set.split_where(|index| is_first(set, index));
-        let (reflected, refracted) = (split(&self.reflected), split(&self.refracted));
+        let reflected = self.reflected.split_where(|index| is_first(1, index));
+        let refracted = self.refracted.split_where(|index| is_first(2, index));
         let record = || self.record.clone();
         let [first_masks, other_masks] = masks;
         (

@@ -85,8 +85,7 @@ fn run_sets(
         return Err(TaskError::Failed { class: FailClass::Input, message });
     };
     let disks = model.len() as u32;
-    let sets = [&model.straight, &model.reflected, &model.refracted];
-    let [straight, reflected, refracted] = sets.map(|set| band_of(set, task, spec));
+    let [straight, reflected, refracted] = model.sets().map(|set| band_of(set, task, spec));
     let bands = [straight?, reflected?, refracted?];
     let water = model.record.surface();
     let views = if bands.iter().all(Vec::is_empty) {
@@ -98,11 +97,7 @@ fn run_sets(
         tracing::warn!("no view shows a surface to train at the borders");
         return output_of(read(path)?, disks, 0);
     };
-    let is_trained = |set: &Gaussians, index: usize| {
-        let at = sets.iter().position(|known| std::ptr::eq(*known, set));
-        at.is_some_and(|at| bands[at].binary_search(&index).is_ok())
-    };
-    let (part, rest) = model.split_where(is_trained);
+    let (part, rest) = model.split_where(|set, index| bands[set].binary_search(&index).is_ok());
     let ([focus, context], surface) = surface_part(part, rest, &task.config.surface);
     let most = focus.len() + surface.reflected.len() + surface.refracted.len();
     let config = TrainConfig { max_gaussians: most as u32, ..task.train_config() };
@@ -131,8 +126,7 @@ fn run_sets(
     if let Some(trained) = trained {
         // A disk that only stands for an empty band stays as it was.
         let none = Gaussians::empty(trained.straight.sh_degree);
-        let all = [&trained.straight, &trained.reflected, &trained.refracted];
-        let with = [0, 1, 2].map(|set| if bands[set].is_empty() { &none } else { all[set] });
+        let with = [0, 1, 2].map(|set| if bands[set].is_empty() { &none } else { trained.sets()[set] });
         let bands = [&bands[0][..], &bands[1][..], &bands[2][..]];
         ply::replace_surface_rows(&mut bytes, &path.display().to_string(), bands, with)?;
     }

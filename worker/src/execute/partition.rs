@@ -130,7 +130,8 @@ fn own_sets(
     let distance = task.common.viewing_distance.map(|distance| IN_AIR * distance);
     let solid = model.dry().surfaces(distance);
     let (own, mut rest) = model.split_by(|mean| inside.contains(DVec3::from(mean.map(f64::from))));
-    let (shared, focus) = own.split_where(|set, index| set.is_wide(index, distance));
+    let sets = own.sets();
+    let (shared, focus) = own.split_where(|set, index| sets[set].is_wide(index, distance));
     rest.append(&shared);
     let config = task.train_config().continued();
     let shared_count = shared.len();

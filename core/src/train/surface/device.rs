@@ -280,7 +280,7 @@ impl DeviceSurface {
         &self.maps.partials
     }
 
-    /// Records that disks of `blocks` below the surface become black and half masked.
+    /// Records that disks of `blocks` below the surface become black and mostly masked.
     ///
     /// # Errors
     /// When a kernel does not compile.
