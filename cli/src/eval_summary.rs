@@ -3,7 +3,7 @@
 use fathom_core::water::WaterRecord;
 use serde_json::{Value, json};
 
-use crate::{open_water, seams};
+use crate::{open_water, seams, water_region};
 
 /// The metrics as text.
 pub fn summary(metrics: &Value) -> String {
@@ -52,12 +52,15 @@ pub fn summary(metrics: &Value) -> String {
     }
     if let Some(truth) = metrics.get("truth") {
         let value = |key: &str| truth.get(key).and_then(Value::as_f64).unwrap_or(f64::NAN);
-        lines.push(format!(
-            "truth:   PSNR {:.2} dB as rendered, {:.2} dB with one gain a channel, on {} views",
-            value("psnr"),
-            value("psnr_with_gain"),
-            truth.get("views").and_then(Value::as_array).map_or(0, Vec::len)
-        ));
+        if truth.get("psnr").is_some() {
+            lines.push(format!(
+                "truth:   PSNR {:.2} dB as rendered, {:.2} dB with one gain a channel, on {} views",
+                value("psnr"),
+                value("psnr_with_gain"),
+                truth.get("views").and_then(Value::as_array).map_or(0, Vec::len)
+            ));
+        }
+        lines.extend(water_region::summary_lines(truth));
         lines.extend(open_water::summary_lines(truth));
     }
     lines.extend(water_lines(metrics));

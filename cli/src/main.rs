@@ -27,6 +27,7 @@ mod settings;
 mod upload;
 mod verbs;
 mod viewed;
+mod water_region;
 mod white_point;
 
 use std::process::ExitCode;

@@ -19,7 +19,7 @@ use fathom_core::picture::{Photograph, prepare, prepared_camera};
 use fathom_core::scene::{Purpose, Scene, learning_scale, load_scene};
 use fathom_core::surface::{Surface, SurfaceModel};
 use fathom_core::train::surface::{SurfaceTrainer, surface_run};
-use fathom_core::train::{TrainRun, Trainer, initial_gaussians};
+use fathom_core::train::{Progress, TrainRun, Trainer, initial_gaussians};
 use fathom_core::views::{InMemory, PackedImage, TrainView, ViewSource};
 use serde_json::{Value, json};
 
@@ -27,6 +27,34 @@ type Fallible<T> = Result<T, Box<dyn Error>>;
 
 /// Refractive index of the oil of the truth.
 const OIL: f64 = 1.46;
+
+/// Iterations between two lines of progress.
+const BLOCK: u32 = 250;
+
+/// What the blocks of a run took.
+#[derive(Default)]
+struct Pace {
+    /// Its last iteration, and its seconds, by block.
+    blocks: Vec<(u32, f64)>,
+}
+
+impl Pace {
+    fn time(&mut self, advance: impl FnOnce() -> fathom_core::Result<Progress>) -> Fallible<Progress> {
+        let begin = Instant::now();
+        let progress = advance()?;
+        self.blocks.push((progress.iteration, begin.elapsed().as_secs_f64()));
+        Ok(progress)
+    }
+
+    /// Milliseconds of an iteration in the last quarter of the run, when all Gaussians are there.
+    fn at_the_end(&self) -> Option<f64> {
+        let end = self.blocks.last()?.0;
+        let late: Vec<_> = self.blocks.windows(2).filter(|pair| pair[0].0 >= end - end / 4).collect();
+        let iterations: u32 = late.iter().map(|pair| pair[1].0 - pair[0].0).sum();
+        let seconds: f64 = late.iter().map(|pair| pair[1].1).sum();
+        (iterations > 0).then(|| 1e3 * seconds / f64::from(iterations))
+    }
+}
 
 struct Arguments {
     scene: PathBuf,
@@ -158,7 +186,7 @@ fn main() -> Fallible<()> {
         views: Arc::new(train),
         config: config.clone(),
     };
-    let mut prior_seconds = 0.0;
+    let (mut prior_seconds, mut pace) = (0.0, Pace::default());
     let (mut shown, surface, counts, model): (Shown, Option<Surface>, Vec<usize>, Option<SurfaceModel>) =
         if method == "wsgs" {
             let (straight, mut surface) =
@@ -168,7 +196,7 @@ fn main() -> Fallible<()> {
             (run.focus, run.surface) = (straight, Some(surface));
             let mut trainer = SurfaceTrainer::new(Arc::clone(&gpu), run)?;
             while trainer.progress().iteration < config.iterations {
-                let progress = trainer.advance(250)?;
+                let progress = pace.time(|| trainer.advance(BLOCK))?;
                 let now = trainer.measure(&test, || true)?;
                 eprintln!(
                     "{:6} loss {:.4} {} disks, {:.2} dB, {:.0} s",
@@ -188,7 +216,9 @@ fn main() -> Fallible<()> {
             (Shown::Surface(Box::new((wet, dry, oil))), Some(model.record.surface()), counts, Some(model))
         } else {
             let mut trainer = Trainer::new(Arc::clone(&gpu), run)?;
-            trainer.advance(config.iterations)?;
+            while trainer.progress().iteration < config.iterations {
+                pace.time(|| trainer.advance(BLOCK))?;
+            }
             let model = trainer.gaussians()?;
             let drawing = Drawing { disks: config.disks, mip_filter: config.mip_filter };
             let renderer = Renderer::new(Arc::clone(&gpu), &model)?.drawn(drawing)?;
@@ -250,6 +280,7 @@ fn main() -> Fallible<()> {
             "refined": settings.refine != SurfaceRefine::Fixed,
             "prior_seconds": prior_seconds,
             "seconds": seconds,
+            "ms_per_step_at_the_end": pace.at_the_end(),
         })
     );
     Ok(())

@@ -3,11 +3,15 @@
 use std::sync::Arc;
 
 use fathom_core::appearance::Settings;
-use fathom_core::config::{Composition, FilmConfig, Medium, Moments, PriorsConfig, TrainConfig, WaterConfig};
+use fathom_core::config::{
+    Composition, FilmConfig, Medium, Moments, PriorsConfig, SurfaceConfig, TrainConfig, WaterConfig,
+};
 use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::{Gpu, device_for_test};
 use fathom_core::memory::{self, MemoryForecast, RunSize, visible_in_fullest_view};
 use fathom_core::scene::{PinholeCamera, Pose};
+use fathom_core::surface::{Surface, SurfaceRecord, WATER};
+use fathom_core::train::surface::{SurfaceRun, SurfaceTrainer};
 use fathom_core::train::{MediumRun, TrainRun, Trainer};
 use fathom_core::views::TrainView;
 use fathom_twins::samples::{grey, random};
@@ -23,6 +27,8 @@ struct Case {
     dark_channel: bool,
     film: bool,
     disks: bool,
+    /// Whether water lies on the floor, up to a tenth of the height of the cameras.
+    surface: bool,
     size: [u32; 2],
     views: u32,
     /// Height of the cameras above a floor of 2 x 2.
@@ -37,7 +43,8 @@ impl Case {
             sh_degree: self.sh_degree,
             moments: self.moments,
             exposure: self.exposure,
-            disks: self.disks,
+            disks: self.disks || self.surface,
+            sets: self.surface.then(|| SurfaceConfig::default().shares),
             refine_steps: 4,
             ..TrainConfig::default()
         }
@@ -72,6 +79,33 @@ impl Case {
         let spacing = 2.0 / f64::from(count.max(1)).sqrt();
         model.log_scales.fill([spacing.ln() as f32; 3]);
         model
+    }
+
+    /// As [`Case::model`], `up` above the floor.
+    fn raised(&self, seed: u32, count: f32, up: f64) -> Gaussians {
+        let mut model = self.model(seed, count as u32);
+        model.means.iter_mut().for_each(|mean| mean[1] -= up as f32);
+        model
+    }
+
+    /// The surface of a case with one; each set begins with half of its share of the cap.
+    fn surface_run(&self) -> TrainRun {
+        let settings = SurfaceConfig::default();
+        let level = self.height / 10.0;
+        let plane = Surface { normal: -DVec3::Y, offset: level, ior: WATER };
+        let none = || Gaussians::empty(self.sh_degree);
+        let sum: f32 = settings.shares.iter().sum();
+        let [straight, refracted, reflected] =
+            settings.shares.map(|share| 0.5 * self.trained as f32 * share / sum);
+        let surface = SurfaceRun {
+            record: SurfaceRecord::given(&plane),
+            pivot: -level * DVec3::Y,
+            reflected: self.raised(8, reflected, 3.0 * level),
+            refracted: self.raised(9, refracted, 0.0),
+            context: [none(), none()],
+            config: settings,
+        };
+        TrainRun { focus: self.raised(5, straight, 1.2 * level), surface: Some(surface), ..self.run() }
     }
 
     fn run(&self) -> TrainRun {
@@ -125,6 +159,7 @@ const CASES: [Case; 6] = {
         dark_channel: false,
         film: false,
         disks: false,
+        surface: false,
         size: [96, 72],
         views: 6,
         height: 2.5,
@@ -156,6 +191,31 @@ const CASES: [Case; 6] = {
         Case { trained: 20_000, disks: true, size: [200, 150], views: 5, ..base },
     ]
 };
+
+#[test]
+fn the_forecast_of_three_sets_is_within_10_percent_of_the_peak() {
+    for (trained, size, height) in
+        [(8000, [160, 120], 2.5), (40_000, [96, 72], 2.5), (20_000, [320, 240], 1.2)]
+    {
+        let case = Case { trained, surface: true, size, height, ..CASES[0] };
+        let Some(gpu) = device_for_test("the forecast of memory with a water surface") else { return };
+        let before = gpu.memory().unwrap().allocated_bytes;
+        gpu.reset_peak();
+        let mut trainer = SurfaceTrainer::new(Arc::clone(&gpu), case.surface_run()).unwrap();
+        trainer.advance(u32::MAX).unwrap();
+        assert!(trainer.model().unwrap().len() as u32 > trained * 9 / 10, "the cap is not filled");
+        let peak = gpu.memory().unwrap().peak_bytes - before;
+        let forecast = case.forecast(&gpu);
+        let ratio = forecast.total() as f64 / peak as f64;
+        println!("{trained} disks at {size:?}: {ratio:.3}");
+        assert!(
+            (0.9..=1.1).contains(&ratio),
+            "{trained} disks: {} bytes forecast, {peak} at the peak: {ratio:.3}\n{forecast:?}\n{:?}",
+            forecast.total(),
+            gpu.memory_by_label()
+        );
+    }
+}
 
 #[test]
 fn the_forecast_is_within_15_percent_of_six_measured_peaks() {

@@ -44,6 +44,22 @@ fn a_pool_becomes_a_model_with_and_without_water() {
     let of_files = again["psnr"].as_f64().expect("a number");
     assert!((of_files - psnr).abs() < 0.01, "{of_files} dB by `fathom eval`, {psnr} dB by the job");
 
+    let truth = under(folder.path(), "pool/truth");
+    let beside = json(&["eval", &out, "--truth", &truth, "--allow-cpu", "--json"]);
+    let region = &beside["truth"]["region"];
+    let number = |key: &str| region.pointer(key).and_then(serde_json::Value::as_f64).expect(key);
+    println!("where the water is: {region}");
+    for (key, least) in [("/psnr", 22.0), ("/dry_psnr", 20.0), ("/oil_psnr", 20.0)] {
+        assert!(number(key) > least, "{key}: {region}");
+    }
+    assert!(number("/dry_psnr") != number("/oil_psnr"), "{region}");
+    assert!(
+        number("/surface/height_error").abs() < 0.01 && number("/surface/tilt_degrees") < 0.5,
+        "{region}"
+    );
+    let said = succeed(&["eval", &out, "--truth", &truth, "--allow-cpu"]);
+    assert!(said.contains("with oil, on 4 views"), "{said}");
+
     let shown = |name: &str, more: &[&str]| {
         let frames = under(folder.path(), name);
         succeed(&[&["render", &out, "--cameras", &scene, "--allow-cpu", "-o", &frames][..], more].concat());

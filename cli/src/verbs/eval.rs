@@ -30,6 +30,7 @@ use crate::output;
 use crate::photographs::{all_cameras, load_photograph, missing};
 use crate::progress::{Progress, Unit};
 use crate::seams;
+use crate::water_region::{Shown, WaterRegion};
 
 /// Arguments of `fathom eval`.
 #[derive(Args, Debug)]
@@ -40,8 +41,8 @@ pub struct EvalArgs {
     /// Scene with the photographs; without it, eval shows the metrics of the result folder
     #[arg(long, short = 's', value_name = "DATA", required_unless_present_any = ["truth", "model"])]
     data: Option<PathBuf>,
-    /// Folder with the truth, as written by `fathom synth`: clear/ and valid/, with open water also alpha/
-    /// and kind/; without --data, its parent folder is the scene
+    /// Folder with the truth that `fathom synth` wrote; without --data, its parent is the scene. It has
+    /// clear/ and valid/, with open water also alpha/ and kind/. That of a pool has region/, dry/ and oil/
     #[arg(long, value_name = "DIR")]
     truth: Option<PathBuf>,
     /// Measure every N-th view by sorted name [default: as in training, otherwise 8]
@@ -192,6 +193,10 @@ fn measure(args: &EvalArgs) -> Result<Value> {
     let (mut measured, mut views) = (Vec::new(), Vec::new());
     let true_water = args.truth.as_deref().map(TruthWater::read).transpose()?.flatten();
     let mut open_water = OpenWater::default();
+    let mut region = match &args.truth {
+        Some(truth) => WaterRegion::open(truth, &gpu, &path)?,
+        None => None,
+    };
     for (index, view) in held_out {
         let (camera, photograph) = load_photograph(&scene, view, &config)?;
         let rendered = match &mut surface {
@@ -231,6 +236,10 @@ fn measure(args: &EvalArgs) -> Result<Value> {
             }
         };
         views.push(of_view);
+        if let Some(region) = &mut region {
+            let shown = Shown { photograph: &photograph, wet: &render, dry: &clear };
+            region.add(&scene, view, &camera, &shown, &config)?;
+        }
         if let Some(truth) = &args.truth {
             let taken_with = scene.camera(view.camera_id).ok_or_else(|| missing(&scene, view, "camera"))?;
             if let Some(surfaces) = SurfaceTruth::read(truth, &picture_stem(&view.name), taken_with, &camera)?
@@ -282,8 +291,12 @@ fn measure(args: &EvalArgs) -> Result<Value> {
     }
     if let Some(truth) = &args.truth {
         let pairs: Vec<_> = measured.iter().filter_map(Measured::pair).collect();
-        result["truth"] = against_truth(truth, &pairs)?;
+        result["truth"] = match (pairs.is_empty(), &region) {
+            (true, Some(_)) => json!({}),
+            _ => against_truth(truth, &pairs)?,
+        };
         result["truth"]["open_water"] = open_water.report();
+        result["truth"]["region"] = region.map_or(Value::Null, WaterRegion::report);
         if let Some(record) = &water {
             result["truth"]["water"] =
                 true_water.map_or(Value::Null, |truth| water_against_truth(&truth, record));

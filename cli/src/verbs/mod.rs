@@ -10,7 +10,7 @@ mod export;
 mod inspect;
 mod logs;
 mod ls;
-mod render;
+pub mod render;
 mod show;
 mod steer;
 mod store;
