@@ -193,7 +193,7 @@ def gpu_table(rows):
     """The newest result of each run on each card: whole trainings, and sums beside gsplat."""
     newest = {}
     for row in rows:
-        shown = row["figure"] in ("gpu_scene", "gpu_mcmc") or row["figure"] == "gpu_gsplat" and "sum" in row.get("variant", "")
+        shown = row["figure"] in ("gpu_scene", "gpu_mcmc", "gpu_pool") or row["figure"] == "gpu_gsplat" and "sum" in row.get("variant", "")
         if shown and row.get("values") and not row.get("settings", {}).get("rehearsal"):
             newest[row.get("adapter", ""), row["figure"], row.get("scene", ""), row.get("variant", "")] = row
     if not newest:
