@@ -18,7 +18,7 @@ pool="$out/pool"
 [ -d "$pool" ] || "$programs/fathom" synth "$pool" --kind pool --size 160x120 >"$out/pool.log"
 
 # name, arguments of the example
-masked="--surface join=masked --surface from=0.257"
+masked="--surface join=masked"
 rows=(
     "wsgs|"
     "schlick|--surface reflectance=schlick"

@@ -5,6 +5,7 @@ use fathom_core::gaussians::SH_C0;
 use glam::{DMat3, DQuat, DVec3};
 
 use crate::ply_rows::Splat;
+use crate::thinning::Standing;
 
 /// A row of a partition's result: index of the partition in the plan, and of the row.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -42,6 +43,11 @@ pub struct Candidate {
 pub struct Rank(u32, u64, RowId);
 
 impl Candidate {
+    /// What decides whether it stays under the cap.
+    pub fn standing(&self) -> Standing {
+        Standing { set: self.set, logit: self.logit }
+    }
+
     /// Its rank in the order of decisions.
     pub fn rank(&self) -> Rank {
         Rank(!ascending(self.logit), self.content, self.id)

@@ -11,7 +11,7 @@ use std::path::Path;
 use crate::ply_rows::{BLOCK_ROWS, Blocks};
 use crate::source::{Extent, Place, RowBlock, Source};
 use crate::survey::Survey;
-use crate::thinning::Thinning;
+use crate::thinning::{Standing, Thinning};
 use crate::{MergeError, MergedBlock, MergedPartition};
 
 /// Bytes after which a buffer is written; the last block may pass it.
@@ -191,7 +191,7 @@ impl<'a> KeptRows<'a> {
             if duplicates.first() == Some(&row) {
                 duplicates = &duplicates[1..];
                 counts.duplicates += 1;
-            } else if self.thinning.keeps(logit) {
+            } else if self.thinning.keeps(Standing { set: layout.set(bytes), logit }) {
                 bounds.add(mean, layout.log_scales(bytes));
                 buffer.copy_within(at..at + row_bytes, end);
                 end += row_bytes;

@@ -15,6 +15,7 @@ use std::collections::{BTreeMap, HashMap};
 
 use crate::MergeError;
 use crate::candidate::{Bounds, Candidate, Rank, RowId};
+use crate::thinning::Standing;
 
 /// Bytes of a candidate while a region is decided: itself, its rank, its state and its entry in the spatial
 /// hash.
@@ -64,8 +65,8 @@ impl Region {
 /// Removed rows, and rows that depend on other regions.
 #[derive(Default)]
 pub struct Decisions {
-    /// Removed rows with the logits of their opacities.
-    removed: HashMap<RowId, f32>,
+    /// Removed rows.
+    removed: HashMap<RowId, Standing>,
     open: Vec<Open>,
 }
 
@@ -74,15 +75,15 @@ pub struct Decisions {
 pub struct Duplicate {
     /// Row of its partition's file.
     pub row: u32,
-    /// Logit of its opacity.
-    pub logit: f32,
+    /// Its set and opacity.
+    pub standing: Standing,
 }
 
 /// A candidate that is removed unless all of `above` are: earlier candidates that agree with it.
 struct Open {
     rank: Rank,
     id: RowId,
-    logit: f32,
+    standing: Standing,
     above: Vec<RowId>,
 }
 
@@ -138,14 +139,14 @@ impl Decisions {
             });
             if goes {
                 if inside {
-                    self.removed.insert(candidate.id, candidate.logit);
+                    self.removed.insert(candidate.id, candidate.standing());
                 }
                 continue;
             }
             // A candidate outside may depend on others outside.
             is_open[index as usize] = !inside || !above.is_empty();
             if inside && !above.is_empty() {
-                self.open.push(Open { rank, id: candidate.id, logit: candidate.logit, above });
+                self.open.push(Open { rank, id: candidate.id, standing: candidate.standing(), above });
             }
             earlier.insert(index, candidate);
         }
@@ -156,12 +157,12 @@ impl Decisions {
         self.open.sort_unstable_by_key(|open| open.rank);
         for open in &self.open {
             if open.above.iter().any(|id| !self.removed.contains_key(id)) {
-                self.removed.insert(open.id, open.logit);
+                self.removed.insert(open.id, open.standing);
             }
         }
         let mut by_partition: BTreeMap<u32, Vec<Duplicate>> = BTreeMap::new();
-        for (RowId { partition, row }, logit) in self.removed {
-            by_partition.entry(partition).or_default().push(Duplicate { row, logit });
+        for (RowId { partition, row }, standing) in self.removed {
+            by_partition.entry(partition).or_default().push(Duplicate { row, standing });
         }
         by_partition.values_mut().for_each(|rows| rows.sort_unstable_by_key(|duplicate| duplicate.row));
         by_partition

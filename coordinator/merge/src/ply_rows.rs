@@ -76,13 +76,18 @@ impl Layout {
         self.splat.map(|splat| splat.log_scales.map(|at| float(row, at)))
     }
 
+    /// [`Splat::set`]; 0 where rows have none.
+    pub fn set(&self, row: &[u8]) -> f32 {
+        self.splat.and_then(|splat| splat.set).map_or(0.0, |at| float(row, at))
+    }
+
     /// Shape and colour; `None` where rows have none.
     pub fn splat(&self, row: &[u8]) -> Option<Splat> {
         self.splat.map(|splat| Splat {
             log_scales: splat.log_scales.map(|at| float(row, at)),
             quat_wxyz: splat.quat_wxyz.map(|at| float(row, at)),
             colour: splat.colour.map(|at| float(row, at)),
-            set: splat.set.map_or(0.0, |at| float(row, at)),
+            set: self.set(row),
         })
     }
 

@@ -17,7 +17,7 @@ use crate::candidate::{Bounds, Candidate, RowId};
 use crate::near_borders::NearBorders;
 use crate::ply_rows::BLOCK_ROWS;
 use crate::source::{Extent, Place, RowBlock, Source};
-use crate::thinning::{Opacities, bin};
+use crate::thinning::{Opacities, Standing, bin};
 
 /// The result of the first pass.
 pub struct Survey {
@@ -40,7 +40,7 @@ pub fn survey(sources: &[Source<'_>], config: &MergeConfig) -> Result<Survey, Me
     let blocks: Vec<Vec<RowBlock>> = surveyed.into_iter().collect::<Result<_, _>>()?;
     let gone = pass.duplicates(sources, &blocks)?;
     let mut opacities = pass.opacities.into_inner().unwrap_or_else(PoisonError::into_inner);
-    gone.values().flatten().for_each(|row| opacities.remove(row.logit));
+    gone.values().flatten().for_each(|row| opacities.remove(row.standing));
     let rows_of = |source: &Source<'_>| {
         let rows = gone.get(&source.index).into_iter().flatten();
         rows.map(|row| row.row).collect()
@@ -68,7 +68,7 @@ impl Pass {
             bounds: config.duplicates.then(|| Bounds::new(config)),
             share: config.band,
             viewing_distance: viewing_distance.map(|distance| distance as f32),
-            opacities: Mutex::new(Opacities::new()),
+            opacities: Mutex::new(Opacities::default()),
             near_borders: NearBorders::new((config.memory_mib as usize) << 20),
         }
     }
@@ -76,7 +76,7 @@ impl Pass {
     fn survey(&self, source: &Source<'_>) -> Result<Vec<RowBlock>, MergeError> {
         let file = &source.file;
         let bands = Bands::new(source.partition, self.share);
-        let mut opacities = Opacities::new();
+        let mut opacities = Opacities::default();
         let mut hasher = blake3::Hasher::new();
         hasher.update(&file.header);
         let mut reader = file.open()?;
@@ -87,7 +87,7 @@ impl Pass {
             reader.read(block, rows)?;
             hasher.update(rows);
             let mut candidates = Vec::new();
-            let visit = |logit| opacities.add(logit);
+            let visit = |standing| opacities.add(standing);
             blocks.push(self.look(source, block, rows, &bands, visit, &mut candidates));
             self.near_borders.add(candidates);
         }
@@ -103,15 +103,15 @@ impl Pass {
         Ok(blocks)
     }
 
-    /// Surveys one block: calls `visit` with the opacity's logit of each Gaussian of the cell, and adds
-    /// possible duplicates to `candidates`.
+    /// Surveys one block: calls `visit` with set and opacity of each Gaussian of the cell, and adds possible
+    /// duplicates to `candidates`.
     pub fn look(
         &self,
         source: &Source<'_>,
         block: u64,
         rows: &[u8],
         bands: &Bands,
-        mut visit: impl FnMut(f32),
+        mut visit: impl FnMut(Standing),
         candidates: &mut Vec<Candidate>,
     ) -> RowBlock {
         let layout = &source.file.layout;
@@ -129,7 +129,7 @@ impl Pass {
             };
             inside += 1;
             lowest_bin = lowest_bin.min(bin(logit));
-            visit(logit);
+            visit(Standing { set: layout.set(row), logit });
             bounds.add(mean, layout.log_scales(row));
             let id = RowId { partition: source.index, row: (block * BLOCK_ROWS) as u32 + at as u32 };
             if let Some(candidate) = self.candidate(source, id, row, aligned, bands) {

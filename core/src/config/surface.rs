@@ -82,9 +82,9 @@ pub struct SurfaceConfig {
     /// shows through where the scene above is transparent. `masked` is that of the paper (eq. 12); mask and
     /// reset settings count for it only.
     pub join: SurfaceJoin,
-    /// Share of the run before which only the scene above water is trained. Default 0; the
-    /// paper has 18/70, which `masked` needs.
-    pub from: f32,
+    /// Share of the run before which only the scene above water is trained. Default: 0, and 18/70 with
+    /// `masked` (WSGS), which needs that scene to start from.
+    pub from: Option<f32>,
     /// Shares of the cap: scene above water, refracted set, reflected set. Default 0.45, 0.48, 0.07.
     pub shares: [f32; 3],
     /// Weight of the loss between mask and pseudo-mask (WSGS eq. 15). Default 0.5; the paper has 0.05, in
@@ -110,6 +110,23 @@ pub struct SurfaceConfig {
 }
 
 impl SurfaceConfig {
+    /// The value of [`SurfaceConfig::from`] or its default.
+    pub fn begins_at(&self) -> f32 {
+        self.from.unwrap_or(match self.join {
+            SurfaceJoin::Over => 0.0,
+            SurfaceJoin::Masked => 18.0 / 70.0,
+        })
+    }
+
+    /// The settings of a coarse model of `gaussians` in a job of `of_job`. Partitions train no part of the
+    /// reflected set, so it has its whole share of the job, at the cost of the others.
+    #[must_use]
+    pub fn of_coarse_run(&self, gaussians: u32, of_job: u32) -> Self {
+        let [straight, refracted, reflected] = self.shares;
+        let reflected = reflected * (of_job as f32 / gaussians.max(1) as f32).max(1.0);
+        Self { shares: [straight, refracted, reflected], ..self.clone() }
+    }
+
     /// Reports every fault.
     pub(super) fn validate(&self, require: &mut impl FnMut(bool, &str)) {
         let share = |value: f32| (0.0..=1.0).contains(&value);
@@ -131,8 +148,8 @@ impl SurfaceConfig {
             "surface.shares must be three numbers above 0",
         );
         require(
-            self.from < 1.0
-                && [self.from, self.mask_from, self.reset_every, self.reset_until, self.refine_until]
+            self.begins_at() < 1.0
+                && [self.begins_at(), self.mask_from, self.reset_every, self.reset_until, self.refine_until]
                     .into_iter()
                     .all(share),
             "surface.from, mask_from, reset_every, reset_until and refine_until must be shares of the run, and \
@@ -158,7 +175,7 @@ impl Default for SurfaceConfig {
             reflectance: Reflectance::Fresnel,
             light: SurfaceLight::Linear,
             join: SurfaceJoin::Over,
-            from: 0.0,
+            from: None,
             shares: [0.45, 0.48, 0.07],
             mask_weight: 0.5,
             mask_from: 18.0 / 70.0,
@@ -170,5 +187,24 @@ impl Default for SurfaceConfig {
             tilt_lr: 1e-4,
             refine_until: 30.0 / 70.0,
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_coarse_model_has_the_whole_reflected_set_of_its_job() {
+        let config = SurfaceConfig::default();
+        let reflected =
+            |config: &SurfaceConfig, cap: f32| cap * config.shares[2] / config.shares.iter().sum::<f32>();
+        let coarse = config.of_coarse_run(4000, 16_000);
+        assert_eq!(coarse.shares[..2], config.shares[..2]);
+        // 1120 of 16,000 in the job; the other sets shrink in proportion.
+        assert!((reflected(&config, 16_000.0) - 1120.0).abs() < 1.0);
+        assert!((900.0..1120.0).contains(&reflected(&coarse, 4000.0)), "{:?}", coarse.shares);
+        assert_eq!(config.of_coarse_run(16_000, 16_000), config);
+        assert_eq!(config.of_coarse_run(16_000, 4000), config);
     }
 }

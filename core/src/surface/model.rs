@@ -28,6 +28,9 @@ pub struct SurfaceModel {
 }
 
 impl SurfaceModel {
+    /// The number of the reflected set in [`SurfaceModel::sets`].
+    pub const REFLECTED: usize = 1;
+
     /// Disks of all sets.
     pub fn len(&self) -> usize {
         self.straight.len() + self.reflected.len() + self.refracted.len()

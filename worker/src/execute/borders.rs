@@ -98,7 +98,10 @@ fn run_sets(
         return output_of(read(path)?, disks, 0);
     };
     let (part, rest) = model.split_where(|set, index| bands[set].binary_search(&index).is_ok());
-    let ([focus, context], surface) = surface_part(part, rest, &task.config.surface);
+    let none = || Gaussians::empty(part.straight.sh_degree);
+    let no_more = [none(), none()];
+    let ([focus, context], surface) =
+        surface_part(part, rest, no_more, &task.train_config(), &task.config.surface);
     let most = focus.len() + surface.reflected.len() + surface.refracted.len();
     let config = TrainConfig { max_gaussians: most as u32, ..task.train_config() };
     let config = task.config.borders.of_run(config);

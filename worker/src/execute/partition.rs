@@ -10,8 +10,8 @@ use fathom_core::config::TrainConfig;
 use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::{Gpu, Renderer};
 use fathom_core::ply;
-use fathom_core::surface::Surface;
-use fathom_core::train::surface::surface_part;
+use fathom_core::surface::{Surface, SurfaceModel};
+use fathom_core::train::surface::{disks_at_points, surface_part};
 use fathom_core::train::{MediumRun, clear_points, surface_points};
 use fathom_core::views::ViewSource;
 use fathom_proto::worker::v1::{Artifact, FailClass, FocusBox, PartitionSpec};
@@ -131,17 +131,27 @@ fn own_sets(
     let solid = model.dry().surfaces(distance);
     let (own, mut rest) = model.split_by(|mean| inside.contains(DVec3::from(mean.map(f64::from))));
     let sets = own.sets();
-    let (shared, focus) = own.split_where(|set, index| sets[set].is_wide(index, distance));
+    // Pixels of all partitions see the whole reflected set. If each trained its part, every refracted set
+    // would fit reflections that the merged model does not show.
+    let is_shared = |set: usize, index| set == SurfaceModel::REFLECTED || sets[set].is_wide(index, distance);
+    let (shared, focus) = own.split_where(is_shared);
     rest.append(&shared);
     let config = task.train_config().continued();
     let shared_count = shared.len();
+    // What is submitted unchanged counts too; of the reflected set it is a whole share.
+    let room = config.max_gaussians.saturating_sub(shared_count as u32).max(focus.len() as u32);
+    let config = TrainConfig { max_gaussians: room, ..config };
     let shared = Unchanged::Sets(Box::new(shared));
     if focus.is_empty() {
         tracing::warn!(shared = shared_count, "this partition has nothing to train");
         let nothing = Parts::only(Gaussians::empty(config.sh_degree));
         return Ok(OwnPart { parts: Parts { shared, ..nothing }, views, config });
     }
-    let ([focus, context], run) = surface_part(focus, rest, &task.config.surface);
+    let points =
+        disks_at_points(&read_points(task)?, views.views(), &task.common.views, &config, &focus.record)?;
+    let points =
+        points.map(|disks| disks.split_by(|mean| inside.contains(DVec3::from(mean.map(f64::from)))).0);
+    let ([focus, context], run) = surface_part(focus, rest, points, &config, &task.config.surface);
     let parts = Parts { context, shared, surface: Some(run), ..Parts::only(focus) };
     let views = own_pixels(gpu, task, &solid, Some(&surface), inside, views, control)?;
     Ok(OwnPart { parts, views, config })

@@ -23,7 +23,7 @@ use fathom_proto::v1::{self, Progress};
 use fathom_proto::worker::v1::CommonSpec;
 
 use super::previews::Previews;
-use super::{Control, Stop, TaskError, TaskInput, TaskOutput};
+use super::{Control, Stop, TaskError, TaskInput, TaskOutput, Work};
 use crate::views::DiskWait;
 
 /// Device time between two checks of the control.
@@ -64,8 +64,11 @@ pub fn parts_of_points(
     let views = &views;
     let (points, config) = (read_points(task)?, task.train_config());
     if task.config.method.through_surface() {
-        let (focus, surface) =
-            surface_run(&points, views.views(), &task.common.views, &config, &task.config.surface)?;
+        let mut settings = task.config.surface.clone();
+        if matches!(task.work, Work::Global(_)) {
+            settings = settings.of_coarse_run(config.max_gaussians, task.config.train.max_gaussians);
+        }
+        let (focus, surface) = surface_run(&points, views.views(), &task.common.views, &config, &settings)?;
         return Ok((Parts { surface: Some(surface), ..Parts::only(focus) }, Arc::clone(views)));
     }
     let full = task.full_views(views)?;

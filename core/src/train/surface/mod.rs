@@ -21,7 +21,7 @@ use std::sync::Arc;
 use glam::DVec3;
 
 pub use device::{DeviceSurface, Frames, SetGradients, record_agreement};
-pub use start::{surface_part, surface_run};
+pub use start::{disks_at_points, surface_part, surface_run};
 
 use super::{HeldOutMetrics, Part, Preview, Progress, TrainRun, Trainer};
 use crate::config::{
@@ -107,7 +107,7 @@ impl SurfaceTrainer {
             record: record.clone(),
         };
         let iterations = run.config.iterations;
-        let from = share_of(iterations, config.from).min(iterations);
+        let from = share_of(iterations, config.begins_at()).min(iterations);
         let device = DeviceSurface::new(&gpu, uniform_of(&record), pivot.as_vec3().to_array())?;
         let caps = caps(run.config.max_gaussians, config.shares);
         let side = |[focus, context]: [Gaussians; 2], cap: u32, seed: u32, own: TrainConfig| TrainRun {

@@ -1,5 +1,7 @@
 //! The starts of the sets of a scene with a water surface.
 
+use std::collections::HashSet;
+
 use glam::DVec3;
 
 use super::SurfaceRun;
@@ -8,7 +10,9 @@ use crate::config::{SurfaceConfig, SurfaceJoin, SurfaceRefine, SurfaceStart, Tra
 use crate::gaussians::{Gaussians, SH_C0};
 use crate::rng::{Stream, random_bits, uniform};
 use crate::scene::Points;
-use crate::surface::{Surface, SurfaceModel, SurfaceOptions, SurfaceRecord, SurfaceSource, surface_prior};
+use crate::surface::{
+    Surface, SurfaceError, SurfaceModel, SurfaceOptions, SurfaceRecord, SurfaceSource, surface_prior,
+};
 use crate::train::init::{gaussians_from_points, initial_gaussians, initial_gaussians_within, limit, turn};
 use crate::views::TrainView;
 
@@ -100,14 +104,69 @@ pub fn surface_run(
     Ok((straight, run))
 }
 
+/// Disks at the sparse points that a view sees, as at the start of a whole run: above water, and in it.
+///
+/// A coarse model has few disks, and its photographs were small. From them alone, a pool of 4 m in one
+/// partition reached 29.66 dB; with the points beside them 29.83 dB, and 29.89 dB without a coarse model.
+///
+/// Where no view sees the surface, all points are above water.
+///
+/// # Errors
+/// When the surface of `record` lies above a camera.
+pub fn disks_at_points(
+    points: &Points,
+    views: &[TrainView],
+    scene_views: &[u32],
+    train: &TrainConfig,
+    record: &SurfaceRecord,
+) -> Result<[Gaussians; 2]> {
+    let views_here: HashSet<u32> = scene_views.iter().copied().collect();
+    // The straight place of a point that no view sees may be one in the water.
+    let is_seen =
+        |&index: &u32| points.tracks.of(index as usize).iter().any(|view| views_here.contains(view));
+    let seen = if points.tracks.is_empty() {
+        points
+    } else {
+        &points.select(&(0..points.len() as u32).filter(is_seen).collect::<Vec<_>>())
+    };
+    let surface = record.surface();
+    let options = SurfaceOptions {
+        offset: Some(surface.offset),
+        normal: Some(surface.normal),
+        ior: surface.ior,
+        up: None,
+        start: SurfaceStart::Tracks,
+    };
+    let cameras: Vec<_> = views.iter().map(|view| (view.camera, view.pose)).collect();
+    let [dry, wet] = match surface_prior(seen, &cameras, scene_views, &options) {
+        Ok(prior) => [prior.dry_points(seen), prior.wet_points()],
+        Err(SurfaceError::NotSeen { .. }) => [seen.clone(), Points::default()],
+        Err(error) => return Err(error.into()),
+    };
+    // Few views cannot say of all points in the water that they are.
+    let dry = dry.select(&above(&dry, |mean| surface.height(DVec3::from(mean.map(f64::from))) > 0.0));
+    let at = |points: &Points| -> Result<Gaussians> {
+        if points.is_empty() {
+            return Ok(Gaussians::empty(train.sh_degree));
+        }
+        let mut model = gaussians_from_points(points, OPACITY, train.sh_degree)?;
+        turn(&mut model, train.seed);
+        Ok(model)
+    };
+    Ok([at(&dry)?, at(&wet)?])
+}
+
 /// The start of a run that trains a part of a model beside the rest of it: its straight focus and context,
 /// and the surface, which stays where it is.
 ///
-/// Each set gets the share of the cap that it has of the part. A set of which the part has nothing takes a
-/// disk of the context: it is trained, but lies elsewhere, so a merge drops it.
+/// Each set gets the share of the cap that it has of the part. As many of the disks of `more`, straight and
+/// refracted, as fit under its cap are trained too. A set of which the part has nothing takes a disk of the
+/// context: it is trained, but lies elsewhere, so a merge drops it.
 pub fn surface_part(
     mut part: SurfaceModel,
     mut rest: SurfaceModel,
+    more: [Gaussians; 2],
+    train: &TrainConfig,
     config: &SurfaceConfig,
 ) -> ([Gaussians; 2], SurfaceRun) {
     for (own, others) in [
@@ -120,12 +179,16 @@ pub fn surface_part(
         }
     }
     let sets = [&part.straight, &part.refracted, &part.reflected];
-    let config = SurfaceConfig {
-        shares: sets.map(|set| set.len().max(1) as f32),
-        refine: SurfaceRefine::Fixed,
-        from: 0.0,
-        ..config.clone()
-    };
+    let shares = sets.map(|set| set.len().max(1) as f32);
+    let [straight, refracted, _] = super::caps(train.max_gaussians, shares);
+    let [more_straight, more_refracted] = more;
+    for (set, cap, more) in
+        [(&mut part.straight, straight, more_straight), (&mut part.refracted, refracted, more_refracted)]
+    {
+        let more = limit(more, cap.saturating_sub(set.len() as u32), train.seed);
+        (0..more.len()).for_each(|index| set.push_from(&more, index));
+    }
+    let config = SurfaceConfig { shares, refine: SurfaceRefine::Fixed, from: Some(0.0), ..config.clone() };
     let run = SurfaceRun {
         // The plane does not turn.
         pivot: DVec3::ZERO,
@@ -225,4 +288,42 @@ fn dark_disks(places: impl Iterator<Item = DVec3>, config: &TrainConfig) -> Resu
     let coefficients = (usize::from(config.sh_degree) + 1).pow(2);
     model.sh_coeffs.iter_mut().step_by(coefficients).for_each(|colour| *colour = [(DARK - 0.5) / SH_C0; 3]);
     Ok(model)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn disks(count: u32) -> Gaussians {
+        let mut points = Points::default();
+        for index in 0..count {
+            points.push([f64::from(index), 0.0, 0.0], [128; 3]);
+        }
+        if count == 0 { Gaussians::empty(0) } else { gaussians_from_points(&points, OPACITY, 0).unwrap() }
+    }
+
+    #[test]
+    fn a_part_takes_more_disks_up_to_the_cap_of_each_set() {
+        let surface = Surface { normal: DVec3::Y, offset: 0.0, ior: crate::surface::WATER };
+        let model = |[straight, reflected, refracted]: [u32; 3]| SurfaceModel {
+            straight: disks(straight),
+            masks: Vec::new(),
+            reflected: disks(reflected),
+            refracted: disks(refracted),
+            record: SurfaceRecord::given(&surface),
+        };
+        let train = TrainConfig { max_gaussians: 100, ..TrainConfig::default() };
+        let started = |more: [u32; 2]| {
+            let (part, rest) = (model([20, 0, 20]), model([5, 3, 7]));
+            let config = SurfaceConfig::default();
+            let ([focus, context], run) = surface_part(part, rest, more.map(disks), &train, &config);
+            assert_eq!([context.len(), run.context[0].len(), run.context[1].len()], [5, 2, 7]);
+            assert_eq!(run.config.shares, [20.0, 20.0, 1.0]);
+            [focus.len(), run.refracted.len(), run.reflected.len()]
+        };
+        assert_eq!(started([0, 0]), [20, 20, 1]);
+        assert_eq!(started([4, 9]), [24, 29, 1]);
+        // 100 disks in shares of 20, 20 and 1: 49, 49 and 2.
+        assert_eq!(started([500, 500]), [49, 49, 1]);
+    }
 }
