@@ -196,6 +196,8 @@ pub fn finish(
     }
     if let Some(mut model) = trained.surface {
         if let Unchanged::Sets(sets) = shared {
+            // Of the reflected set the run trains one disk that stands for it, and which may be among these.
+            model.reflected = Gaussians::empty(model.reflected.sh_degree);
             model.append(sets);
         }
         return output_of_sets(&model, resumed_from, history);
