@@ -772,6 +772,9 @@ wsgs() {
         { miss "the shifted surface does not train"; return 0; }
     row "pool/shifted" "train_surface POOL --shift 0.18 --surface refine=offset --surface refine_until=1" \
         "the offset ends $(number offset_error "$out/pool-shifted.json") m off" "offset_error=$(number offset_error "$out/pool-shifted.json")"
+    # 3 % of the viewing distance, 2.36.
+    awk -v off="$(number offset_error "$out/pool-shifted.json")" 'BEGIN { exit !(off * off <= 0.0708 * 0.0708) }' ||
+        miss "the shifted surface ends more than 3 % of the viewing distance off"
     long_pool
 }
 # A pool of 4 m in 2x2 partitions against one.
