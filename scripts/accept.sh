@@ -767,6 +767,7 @@ wsgs() {
         gains "$iterations" dry 8
         at_least "$(cat "$out/pool-wsgs-$iterations.dry")" 26 || miss "the dry pool has less than 26 dB"
         at_least "$(cat "$out/pool-wsgs-$iterations.oil")" 25 || miss "the pool of oil has less than 25 dB"
+        cost "$iterations"
     done
     "$program" "$pool" --shift 0.18 --surface refine=offset --surface refine_until=1 >"$out/pool-shifted.json" 2>"$out/pool-shifted.log" ||
         { miss "the shifted surface does not train"; return 0; }
@@ -800,6 +801,17 @@ gains() { # iterations, kind, least gain of wsgs over 3dgs in dB
     local gain
     gain=$(awk -v a="$(cat "$out/pool-wsgs-$1.$2")" -v b="$(cat "$out/pool-3dgs-$1.$2")" 'BEGIN { print a - b }')
     at_least "$gain" "$3" || miss "wsgs gains $(round "$gain") dB ($2) over 3dgs after $1 iterations, not $3"
+}
+# A step of wsgs against one of 3dgs, once all Gaussians are there.
+cost() { # iterations
+    local method times=()
+    for method in wsgs 3dgs; do
+        times+=("$(mean_of ms_per_step_at_the_end "$out/pool-$method-$1-"?.json)")
+    done
+    row "pool/step $1" "train_surface POOL --train iterations=$1" "${times[0]} ms a step, 3dgs ${times[1]} ms" \
+        "wsgs_ms=${times[0]}" "3dgs_ms=${times[1]}"
+    awk -v a="${times[0]}" -v b="${times[1]}" 'BEGIN { exit !(a <= 3 * b) }' ||
+        miss "a step of wsgs takes more than 3 times as long as one of 3dgs: ${times[*]} ms"
 }
 mean_of() { # path of a key, JSON files
     python3 -c 'import json, sys

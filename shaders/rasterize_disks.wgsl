@@ -1,4 +1,4 @@
-//@ import frame, disk, met, rays, votes, exchange_disks
+//@ import frame, disk, met, rays, votes, exchange_disks, needed
 //@ variant rasterize_disks rays=disk_at_pixels
 //@ variant trace_disks rays=traced_at_pixels
 // Blends the disks of a tile, front to back, as rasterize_forward does splats. The rays of its pixels come
@@ -8,13 +8,13 @@
 //   range_image [H*W]  sum of alpha T range, scene units: to where the ray meets the disk, or to the centre
 //             where the low-pass decides; along the ray
 //   normal_image [H*W] vec4: sum of alpha T normal, camera axes, towards the camera; sum of alpha T mask
-//   tile_ends [tiles]  number of the tile's disks that any pixel needed: the backward pass stops there
+//   slots, tile_ends [tiles]  see needed.wgsl
 // Twin: core/twins/src/disks.rs
 
 @group(0) @binding(0) var<uniform> frame: Frame;
 @group(0) @binding(1) var<storage, read> projected: array<vec4<f32>>;
 @group(0) @binding(2) var<storage, read> disks: array<vec4<f32>>;
-@group(0) @binding(3) var<storage, read> slots: array<u32>;
+@group(0) @binding(3) var<storage, read_write> slots: array<u32>;
 @group(0) @binding(4) var<storage, read> visible_from_slot: array<u32>;
 @group(0) @binding(5) var<storage, read> ranges: array<vec2<u32>>;
 @group(0) @binding(6) var<storage, read_write> image: array<vec4<f32>>;
@@ -39,20 +39,22 @@ struct Sums {
 
 var<private> sums_a: Sums;
 var<private> sums_b: Sums;
-// Number of disks that any of the thread's pixels needed.
-var<private> end: u32;
+// The disks of a batch that any of the thread's pixels needed, a bit for each.
+var<private> needed_here: u32;
 
 fn empty(on: vec4<f32>) -> Sums {
     let zero = vec4<f32>(0.0);
     return Sums(vec4<f32>(1.0), on, zero, zero, zero, zero, zero, zero, zero, zero);
 }
 
-// Adds a disk to four pixels and returns its weights.
+// Adds a disk to four pixels. Returns what is not 0 where the backward pass needs it: where it has a weight,
+// and where it ends the ray.
 fn add(sums: ptr<private, Sums>, disk: Splat, met: Met, normal: vec3<f32>) -> vec4<f32> {
     let raw = min(vec4<f32>(MAX_ALPHA), disk.d.y * exp(-0.5 * met.spread));
     let alpha = select(vec4<f32>(0.0), raw, raw >= vec4<f32>(MIN_ALPHA));
     let next = (*sums).T * (1.0 - alpha);
-    (*sums).on = select(vec4<f32>(0.0), (*sums).on, next >= vec4<f32>(MIN_TRANSMITTANCE));
+    let before = (*sums).on;
+    (*sums).on = select(vec4<f32>(0.0), before, next >= vec4<f32>(MIN_TRANSMITTANCE));
     let w = (*sums).on * alpha * (*sums).T;
     (*sums).r += w * disk.e.x;
     (*sums).g += w * disk.e.y;
@@ -63,16 +65,17 @@ fn add(sums: ptr<private, Sums>, disk: Splat, met: Met, normal: vec3<f32>) -> ve
     (*sums).nz += w * normal.z;
     (*sums).mask += w * disk.e.w;
     (*sums).T -= w;
-    return w;
+    return w + (before - (*sums).on);
 }
 
-fn blend(disk: Splat, number: u32) {
+// `i` is its place in the batch.
+fn blend(disk: Splat, i: u32) {
     let plane = plane_of(disk);
     let normal = disk.c.w * plane.normal;
     let w_a = add(&sums_a, disk, meet(disk, plane, rays_a), normal);
     let w_b = add(&sums_b, disk, meet(disk, plane, rays_b), normal);
     let w = w_a + w_b;
-    end = select(end, number + 1u, max(max(w.x, w.y), max(w.z, w.w)) > 0.0);
+    needed_here |= select(0u, 1u << i, max(max(w.x, w.y), max(w.z, w.w)) > 0.0);
 }
 
 fn store_pixel(column: u32, row: u32, rgb: vec3<f32>, range: f32, normal: vec4<f32>, T: f32) {
@@ -102,7 +105,6 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let column = corner.x + lane % TILE;
     let row = corner.y + (lane / TILE) * 8u;
     begin_rays(column, row);
-    end = 0u;
     // Pixels outside the image and pixels without a ray end immediately.
     sums_a = empty(rays_a.on);
     sums_b = empty(rays_b.on);
@@ -110,19 +112,21 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let has_rays = any_thread(lane, begun.x + begun.y + begun.z + begun.w > 0.0);
 
     let range = ranges[tile];
+    front = range.x;
     for (var first = select(range.y, range.x, has_rays); first < range.y; first += BATCH) {
         share_splats(lane, first, range.y);
-        let number = first - range.x;
-        blend(shared_splat(0u), number + 0u);
-        blend(shared_splat(1u), number + 1u);
-        blend(shared_splat(2u), number + 2u);
-        blend(shared_splat(3u), number + 3u);
-        blend(shared_splat(4u), number + 4u);
-        blend(shared_splat(5u), number + 5u);
-        blend(shared_splat(6u), number + 6u);
-        blend(shared_splat(7u), number + 7u);
+        needed_here = 0u;
+        blend(shared_splat(0u), 0u);
+        blend(shared_splat(1u), 1u);
+        blend(shared_splat(2u), 2u);
+        blend(shared_splat(3u), 3u);
+        blend(shared_splat(4u), 4u);
+        blend(shared_splat(5u), 5u);
+        blend(shared_splat(6u), 6u);
+        blend(shared_splat(7u), 7u);
+        keep_needed(lane, first, range.y, needed_here);
         // Every fourth batch: stop if all rays of the tile have ended.
-        if (number / BATCH) % 4u == 3u {
+        if ((first - range.x) / BATCH) % 4u == 3u {
             let on = sums_a.on + sums_b.on;
             if !any_thread(lane, on.x + on.y + on.z + on.w > 0.0) {
                 break;
@@ -130,9 +134,8 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         }
     }
 
-    let furthest = greatest(lane, end);
     if lane == 0u {
-        tile_ends[tile] = furthest;
+        tile_ends[tile] = front - range.x;
     }
     if column < frame.size.x {
         store_four(column, row, sums_a);

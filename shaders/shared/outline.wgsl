@@ -44,12 +44,32 @@ fn whole_image(frame: Frame, centre2d: vec2<f32>, reach: f32) -> Bound {
     return Bound(half - centre2d, vec3<f32>(wide * wide, 0.0, wide * wide));
 }
 
+// Whether the disk of radius `reach` standard deviations lies behind the plane through the eye with the
+// normal `n`. Slack for rounding.
+fn is_behind(n: vec3<f32>, m: vec3<f32>, h_u: vec3<f32>, h_v: vec3<f32>, reach: f32) -> bool {
+    return 1.001 * reach * length(vec2<f32>(dot(n, h_u), dot(n, h_v))) + 1e-5 * length(m) < -dot(n, m);
+}
+
+// Whether all of it lies beside the image.
+fn is_beside(frame: Frame, m: vec3<f32>, h_u: vec3<f32>, h_v: vec3<f32>, reach: f32) -> bool {
+    let least = -frame.principal / frame.focal;
+    let most = least + vec2<f32>(frame.size) / frame.focal;
+    return is_behind(vec3<f32>(1.0, 0.0, -least.x), m, h_u, h_v, reach)
+        || is_behind(vec3<f32>(-1.0, 0.0, most.x), m, h_u, h_v, reach)
+        || is_behind(vec3<f32>(0.0, 1.0, -least.y), m, h_u, h_v, reach)
+        || is_behind(vec3<f32>(0.0, -1.0, most.y), m, h_u, h_v, reach);
+}
+
 // Holds the disk of radius sqrt(squared) standard deviations, and the circle of the low-pass. `centre2d` is
-// its projected centre. A disk that reaches behind the camera may be anywhere: its bound is the whole image.
+// its projected centre. The bound of a disk that reaches behind the camera is the whole image, or the circle
+// if the disk lies beside the image.
 fn bound_of(frame: Frame, m: vec3<f32>, centre2d: vec2<f32>, h_u: vec3<f32>, h_v: vec3<f32>, squared: f32) -> Bound {
     let left = depth_left(m, h_u, h_v, squared);
     let reach = max(sqrt(squared), 1e-3);
     if !(left > LEAST_IN_FRONT * m.z * m.z) {
+        if is_beside(frame, m, h_u, h_v, reach) {
+            return Bound(vec2<f32>(0.0), vec3<f32>(LOW_PASS * LOW_PASS, 0.0, LOW_PASS * LOW_PASS));
+        }
         return whole_image(frame, centre2d, reach);
     }
     let inv_z = 1.0 / m.z;

@@ -22,3 +22,10 @@ fn any_thread(lane: u32, yes: bool) -> bool {
 fn greatest(lane: u32, number: u32) -> u32 {
     return subgroupMax(number);
 }
+
+fn union_of(lane: u32, bits: u32) -> u32 {
+    return subgroupOr(bits);
+}
+
+// The lanes of a vector read and write together.
+fn before_reads() {}

@@ -15,7 +15,7 @@ pub struct Workload {
     /// Evaluations of every intersection at every pixel of its tile.
     pub listed_evaluations: u64,
     /// Evaluations up to the last splat that some pixel of the tile needs: the least that any pass working
-    /// tile by tile can do. The backward pass stops there.
+    /// tile by tile can do. The backward pass stops there. Of disks, only those that are needed count.
     pub needed_evaluations: u64,
 }
 

@@ -100,9 +100,9 @@ pub fn record_backward(
 /// Records the backward pass and the step of a view that was rendered in these bands. Gives the same bytes as
 /// a single band.
 ///
-/// For each band the lists are rebuilt and its gradients are added to those of the earlier bands, per
-/// Gaussian. The step follows after the last band. Each band is a submission, because all bands use one
-/// uniform buffer.
+/// For each band the lists are rebuilt, and those of disks ordered by a forward pass. Its gradients are added
+/// to those of the earlier bands, per Gaussian. The step follows after the last band. Each band is a
+/// submission, because all bands use one uniform buffer.
 ///
 /// # Errors
 /// When a kernel does not compile, the frame has no targets, or the device cannot hold the sums.
@@ -120,7 +120,12 @@ pub fn record_backward_in_bands(
         recorder.clear(training.band_gradients(gpu, block.capacity, row_bytes)?);
     }
     for band in bands {
-        frame.record_lists(gpu, recorder, blocks, band)?;
+        if frame.disks.is_some() {
+            // Moves the disks that are needed to the front of their lists.
+            frame.record_forward(gpu, recorder, blocks, band)?;
+        } else {
+            frame.record_lists(gpu, recorder, blocks, band)?;
+        }
         record_rasterize(recorder, frame, band, buffers)?;
         for (index, block, training) in blocks.trainable() {
             recorder.dispatch(

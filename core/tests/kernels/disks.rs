@@ -11,7 +11,7 @@ use fathom_core::rng::{Stream, uniform_at};
 use fathom_core::train::{BackwardBuffers, DiskBuffers, DiskMaps, LEAST_ALPHA, record_backward};
 use fathom_twins::{
     Disk, DiskGradient, DiskRaster, DiskRasterGradients, DiskRay, Gaussians64, Raster, RasterRules, Sight,
-    Splat, TileLists, bounds_of, intersect, normal_consistency, pinhole_rays, project_disks,
+    Splat, TileLists, bounds_of, depth_order, intersect, normal_consistency, pinhole_rays, project_disks,
     project_disks_backward, samples, trace_backward, trace_forward,
 };
 use glam::DVec3;
@@ -75,9 +75,21 @@ pub fn is_decided(
     width: u32,
     pixel: usize,
 ) -> bool {
+    needed_at(disks, lists, rays, width, pixel).is_some()
+}
+
+/// The disks that the backward pass needs at a pixel: those that are blended, and the one that ends the ray.
+/// `None` if a disk is near a decision.
+fn needed_at(
+    disks: &[Option<Disk>],
+    lists: &TileLists,
+    rays: &[DiskRay],
+    width: u32,
+    pixel: usize,
+) -> Option<Vec<u32>> {
     let (x, y) = (pixel as u32 % width, pixel as u32 / width);
     let rules = RasterRules::HARD;
-    let mut left = 1.0;
+    let (mut left, mut needed) = (1.0, Vec::new());
     for &id in lists.of_tile(x / 16, y / 16) {
         let Some(disk) = &disks[id as usize] else { continue };
         let [a_u, a_v] = disk.axes;
@@ -101,7 +113,7 @@ pub fn is_decided(
                 || (t - nearest).abs() < 1e-4
                 || slant < 2e-3)
         {
-            return false;
+            return None;
         }
         let alpha = full.min(rules.max_alpha);
         if alpha < rules.min_alpha {
@@ -109,14 +121,15 @@ pub fn is_decided(
         }
         let next = left * (1.0 - alpha);
         if near(next, rules.min_transmittance) {
-            return false;
+            return None;
         }
+        needed.push(id);
         if next < rules.min_transmittance {
             break;
         }
         left = next;
     }
-    true
+    Some(needed)
 }
 
 /// How much more the numbers of a scene differ. Rounding of a position is about 1e-7 of the distance, and so
@@ -169,6 +182,58 @@ fn pictures_of_disks_match_the_twin() {
                 }
             }
         }
+    }
+}
+
+#[test]
+fn disks_that_the_backward_pass_needs_come_first_in_order() {
+    for gpu in layouts() {
+        // Opacity 0.9999: two layers end a ray, and most disks are hidden.
+        let mut opaque = samples::random(55, 150, 0);
+        opaque.opacity_logits.fill(9.2);
+        let all = scenes(251, 40, 0).into_iter().chain([Scene::new("opaque", opaque, 75, 53)]);
+        let (mut compared, mut hidden) = (0, 0);
+        for scene in all {
+            let Compared { view, disks, lists, rays, .. } = Compared::new(&gpu, &scene);
+            let name = scene.name;
+            let count = view.counter(counter::INTERSECTIONS);
+            let mut slots: Vec<u32> =
+                gpu.read(view.frame.sorted_slots(view.uniform.tile_count()), 0, count).unwrap();
+            slots.sort_unstable();
+            assert!(slots.iter().copied().eq(0..count as u32), "{name}: a slot is lost, or there twice");
+
+            let ends: Vec<u32> = gpu
+                .read(&view.frame.targets().unwrap().tile_ends, 0, view.uniform.tile_count() as usize)
+                .unwrap();
+            let (width, height) = (scene.camera.width, scene.camera.height);
+            let (tile, across) = (gpu.tile(), view.uniform.tiles[0]);
+            let mut rank = vec![u32::MAX; disks.len()];
+            depth_order(&bounds_of(&disks))
+                .iter()
+                .zip(0..)
+                .for_each(|(&id, place)| rank[id as usize] = place);
+            for (at, (list, &end)) in view.tile_lists().iter().zip(&ends).enumerate() {
+                let kept = &list[..end as usize];
+                assert!(kept.is_sorted_by_key(|&id| rank[id]), "{name}: tile {at} is out of order");
+                let corner = [at as u32 % across * tile, at as u32 / across * tile];
+                let pixels = (corner[1]..height.min(corner[1] + tile))
+                    .flat_map(|y| (corner[0]..width.min(corner[0] + tile)).map(move |x| y * width + x));
+                let needed: Vec<_> =
+                    pixels.map(|pixel| needed_at(&disks, &lists, &rays, width, pixel as usize)).collect();
+                let is_kept = |id: &&u32| kept.contains(&(**id as usize));
+                for id in needed.iter().flatten().flatten() {
+                    assert!(is_kept(&id), "{name}: disk {id} of tile {at} is not kept");
+                }
+                if needed.iter().all(Option::is_some) {
+                    let wanted =
+                        |id: &usize| needed.iter().flatten().flatten().any(|&other| other as usize == *id);
+                    assert!(kept.iter().all(wanted), "{name}: tile {at} keeps a disk that no pixel needs");
+                    compared += 1;
+                    hidden += list.len() - kept.len();
+                }
+            }
+        }
+        assert!(compared > 20 && hidden > 40, "{compared} tiles compared, {hidden} disks not needed");
     }
 }
 

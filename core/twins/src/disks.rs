@@ -140,7 +140,11 @@ fn project(
     let ellipse = if sight.is_bent() {
         sight.ellipse(m, half, reach, camera).map(|cov| (DVec2::ZERO, cov))
     } else {
-        outline(m, half, reach, camera)
+        outline(m, half, reach, camera).or_else(|| {
+            // Only the circle of the low-pass is left.
+            let low_pass = LOW_PASS * LOW_PASS;
+            is_beside(m, half, reach, camera).then_some((DVec2::ZERO, [low_pass, 0.0, low_pass]))
+        })
     };
     let (offset, [xx, xy, yy]) = ellipse.unwrap_or_else(|| whole_image(camera, centre2d, reach));
     let determinant = xx * yy - xy * xy;
@@ -173,6 +177,22 @@ fn whole_image(camera: &PinholeCamera, centre2d: [f64; 2], reach: f64) -> (DVec2
     let half = 0.5 * DVec2::new(camera.width.into(), camera.height.into());
     let wide = (half.length() + 1.0) / if reach.is_finite() { reach.max(LEAST_REACH) } else { 1.0 };
     (half - DVec2::from(centre2d), [wide * wide, 0.0, wide * wide])
+}
+
+/// Whether all of a disk of radius `reach` (in standard deviations) lies behind one of the planes through the
+/// eye and an edge of the image.
+fn is_beside(m: DVec3, half: [DVec3; 2], reach: f64, camera: &PinholeCamera) -> bool {
+    let least = [-camera.cx / camera.fx, -camera.cy / camera.fy];
+    let most =
+        [least[0] + f64::from(camera.width) / camera.fx, least[1] + f64::from(camera.height) / camera.fy];
+    let planes = [
+        DVec3::new(1.0, 0.0, -least[0]),
+        DVec3::new(-1.0, 0.0, most[0]),
+        DVec3::new(0.0, 1.0, -least[1]),
+        DVec3::new(0.0, -1.0, most[1]),
+    ];
+    // Its nearest point is this far in front of the plane.
+    planes.iter().any(|n| n.dot(m) + reach * DVec2::from(half.map(|axis| n.dot(axis))).length() < 0.0)
 }
 
 /// The ellipse that a disk of radius `reach` (in standard deviations) fills, with the circle of the low-pass.

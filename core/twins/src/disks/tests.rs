@@ -3,7 +3,7 @@
 use super::*;
 use crate::finite_differences::{assert_close, derivative};
 use crate::intersect;
-use crate::samples::{all, degenerate, off_centre_view};
+use crate::samples::{all, degenerate, off_centre_view, random};
 use fathom_core::rng::{Stream, uniform_at};
 
 const WIDTH: u32 = 37;
@@ -71,11 +71,36 @@ fn brute_force(
     (rgb + left * DVec3::from(BACKGROUND), 1.0 - left, range)
 }
 
+/// Disks around the camera that reach behind it.
+fn around_the_camera(pose: &Pose) -> Gaussians64 {
+    let mut model = Gaussians64::from(&random(73, 80, 0));
+    for (i, (mean, scales)) in (0..).zip(model.means.iter_mut().zip(&mut model.log_scales)) {
+        let u = |k| f64::from(uniform_at(33, Stream::Test, i, k));
+        let at = DVec3::new(8.0 * (u(0) - 0.5), 8.0 * (u(1) - 0.5), 0.05 + u(2)) - pose.translation;
+        *mean = (pose.rotation.inverse() * at).into();
+        *scales = [u(3) - 1.0, u(4) - 1.0, 0.0];
+    }
+    model
+}
+
+#[test]
+fn a_disk_beside_the_camera_is_in_no_tile_but_its_centres() {
+    let (camera, pose) = off_centre_view(75, 53, 3.0);
+    let model = around_the_camera(&pose);
+    let Rendered { disks, lists, .. } = render(&model, &camera, &pose, &RasterRules::HARD);
+    let tiles = lists.tiles_per_gaussian(model.len());
+    let centred = |disk: &Disk| disk.bound.mean2d == disk.centre2d;
+    let beside = disks.iter().zip(&tiles).filter(|(disk, _)| disk.as_ref().is_some_and(centred)).count();
+    let all = tiles.iter().filter(|&&count| count as usize == lists.ranges.len()).count();
+    assert!(beside > 20 && all > 5, "{beside} beside the image, {all} in all tiles");
+    assert!(tiles.iter().zip(&disks).all(|(&count, disk)| count < 2 || !disk.as_ref().is_some_and(centred)));
+}
+
 #[test]
 fn tiles_of_disks_lose_nothing() {
     for (width, height) in [(75, 53), (17, 1), (1, 33)] {
         let (camera, pose) = off_centre_view(width, height, 3.0);
-        for (name, model) in all(71, 60, 2) {
+        for (name, model) in all(71, 60, 2).into_iter().chain([("around", around_the_camera(&pose))]) {
             let rules = RasterRules::HARD;
             let Rendered { forward, .. } = render(&model, &camera, &pose, &rules);
             for i in 0..width * height {
