@@ -4,6 +4,7 @@
 // Gradients of the blending of disks, for every intersection; see rasterize_backward.
 //
 //   v_pixels vec4: of gather_pixel_gradients [H*W*2], or of surface_compose_backward [H*W] for traced rays
+//   slots, tile_ends [tiles]  see needed.wgsl; what comes behind has no gradient
 //   slot_gradients [intersections*5] vec4: the gradient of disk.wgsl, at the slot where the intersection was
 //            emitted
 // In the coordinates of the disk all gradients are sums of a few products, for any ray: with v_p the gradient

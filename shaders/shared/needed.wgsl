@@ -1,6 +1,6 @@
 // The part of a tile's list that the backward pass needs: Gaussians with a weight at any pixel of the tile,
-// and those that end a ray. Most of a list are neither: they are hidden, or their bound is wider than they
-// are. Needs votes, exchange and the name slots.
+// and those that end a ray. On a pool nearly half of a list are neither: they are hidden, or their bound is
+// wider than they are. Needs votes, exchange and the name slots.
 //
 //   slots     those that are needed come first in the list of the tile, in order; the others follow
 //   tile_ends [tiles]  their number

@@ -228,7 +228,8 @@ impl Frame {
         buffers
     }
 
-    /// The slots sorted by tile, after the forward pass of an image with `tiles` tiles.
+    /// The slots sorted by tile, after the forward pass of an image with `tiles` tiles. In the list of a
+    /// tile, disks that the backward pass needs come first.
     pub fn sorted_slots(&self, tiles: u32) -> &wgpu::Buffer {
         &self.tile_sort.values[Sort::result(tile_bits(tiles))]
     }
