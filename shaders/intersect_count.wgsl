@@ -1,4 +1,6 @@
-//@ import frame, counters, tiles
+//@ import frame, counters, tiles, lists
+//@ variant intersect_count lists=all_tiles
+//@ variant intersect_count_at_surface lists=tiles_with_rays
 // Counts the tiles that each visible Gaussian touches, in depth order.
 //
 // `counts` [visible] is indexed by depth rank and scanned next. One thread per rank.
@@ -26,7 +28,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     for (var y = bounds.y; y < bounds.w; y++) {
         for (var x = bounds.x; x < bounds.z; x++) {
             let tile = vec2<u32>(x, y);
-            count += select(0u, 1u, in_band(frame, tile) && touches(s, tile));
+            count += select(0u, 1u, in_band(frame, tile) && has_list(y * frame.tiles.x + x) && touches(s, tile));
         }
     }
     counts[rank] = count;

@@ -1,4 +1,6 @@
-//@ import frame, counters, tiles
+//@ import frame, counters, tiles, lists
+//@ variant intersect_emit lists=all_tiles
+//@ variant intersect_emit_at_surface lists=tiles_with_rays
 // Writes one entry for each tile that a visible Gaussian touches, front to back.
 //
 //   tile_keys             [intersections]  the tile: the key of the stable tile sort
@@ -40,8 +42,9 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     for (var y = bounds.y; y < bounds.w; y++) {
         for (var x = bounds.x; x < bounds.z; x++) {
             let tile = vec2<u32>(x, y);
-            if slot < end && in_band(frame, tile) && touches(s, tile) {
-                tile_keys[slot] = y * frame.tiles.x + x;
+            let t = y * frame.tiles.x + x;
+            if slot < end && in_band(frame, tile) && has_list(t) && touches(s, tile) {
+                tile_keys[slot] = t;
                 slots[slot] = slot;
                 visible_from_slot[slot] = visible_id;
                 slot++;

@@ -1,13 +1,16 @@
-//@ import frame, disk, met, rays, votes, exchange_disks, needed
-//@ variant rasterize_disks rays=disk_at_pixels
-//@ variant trace_disks rays=traced_at_pixels
+//@ import frame, disk, met, rays, maps, votes, exchange_disks, needed
+//@ variant rasterize_disks rays=from_eye+disk_at_pixels maps=disk_maps
+//@ variant trace_reflected rays=from_mirror+disk_at_pixels maps=no_maps
+//@ variant trace_refracted rays=traced_at_pixels maps=no_maps
 // Blends the disks of a tile, front to back, as rasterize_forward does splats. The rays of its pixels come
-// from the eye, or from a water surface (traced_at_pixels.wgsl).
+// from the eye, or from a water surface that reflects (from_mirror.wgsl) or refracts them
+// (traced_at_pixels.wgsl).
 //
 //   image   [H*W]   vec4: rgb over the background, alpha = 1 - T
 //   range_image [H*W]  sum of alpha T range, scene units: to where the ray meets the disk, or to the centre
-//             where the low-pass decides; along the ray
-//   normal_image [H*W] vec4: sum of alpha T normal, camera axes, towards the camera; sum of alpha T mask
+//             where the low-pass decides; along the ray. Not of traced rays
+//   normal_image [H*W] vec4: sum of alpha T normal, camera axes, towards the camera; sum of alpha T mask.
+//             Not of traced rays
 //   slots, tile_ends [tiles]  see needed.wgsl
 // Twin: core/twins/src/disks.rs
 
@@ -18,8 +21,6 @@
 @group(0) @binding(4) var<storage, read> visible_from_slot: array<u32>;
 @group(0) @binding(5) var<storage, read> ranges: array<vec2<u32>>;
 @group(0) @binding(6) var<storage, read_write> image: array<vec4<f32>>;
-@group(0) @binding(7) var<storage, read_write> range_image: array<f32>;
-@group(0) @binding(8) var<storage, read_write> normal_image: array<vec4<f32>>;
 @group(0) @binding(9) var<storage, read_write> tile_ends: array<u32>;
 
 // State of the thread's pixels: rows 0 to 3 in _a, 4 to 7 in _b.
@@ -30,26 +31,23 @@ struct Sums {
     r: vec4<f32>,
     g: vec4<f32>,
     b: vec4<f32>,
-    range: vec4<f32>,
-    nx: vec4<f32>,
-    ny: vec4<f32>,
-    nz: vec4<f32>,
-    mask: vec4<f32>,
 }
 
 var<private> sums_a: Sums;
 var<private> sums_b: Sums;
+var<private> maps_a: Maps;
+var<private> maps_b: Maps;
 // The disks of a batch that any of the thread's pixels needed, a bit for each.
 var<private> needed_here: u32;
 
 fn empty(on: vec4<f32>) -> Sums {
     let zero = vec4<f32>(0.0);
-    return Sums(vec4<f32>(1.0), on, zero, zero, zero, zero, zero, zero, zero, zero);
+    return Sums(vec4<f32>(1.0), on, zero, zero, zero);
 }
 
 // Adds a disk to four pixels. Returns what is not 0 where the backward pass needs it: where it has a weight,
 // and where it ends the ray.
-fn add(sums: ptr<private, Sums>, disk: Splat, met: Met, normal: vec3<f32>) -> vec4<f32> {
+fn add(sums: ptr<private, Sums>, maps: ptr<private, Maps>, disk: Splat, met: Met, normal: vec3<f32>) -> vec4<f32> {
     let raw = min(vec4<f32>(MAX_ALPHA), disk.d.y * exp(-0.5 * met.spread));
     let alpha = select(vec4<f32>(0.0), raw, raw >= vec4<f32>(MIN_ALPHA));
     let next = (*sums).T * (1.0 - alpha);
@@ -59,12 +57,8 @@ fn add(sums: ptr<private, Sums>, disk: Splat, met: Met, normal: vec3<f32>) -> ve
     (*sums).r += w * disk.e.x;
     (*sums).g += w * disk.e.y;
     (*sums).b += w * disk.e.z;
-    (*sums).range += w * select(vec4<f32>(disk.d.z), met.t * met.lengths, met.is_hit);
-    (*sums).nx += w * normal.x;
-    (*sums).ny += w * normal.y;
-    (*sums).nz += w * normal.z;
-    (*sums).mask += w * disk.e.w;
     (*sums).T -= w;
+    add_maps(maps, disk, met, normal, w);
     return w + (before - (*sums).on);
 }
 
@@ -72,26 +66,23 @@ fn add(sums: ptr<private, Sums>, disk: Splat, met: Met, normal: vec3<f32>) -> ve
 fn blend(disk: Splat, i: u32) {
     let plane = plane_of(disk);
     let normal = disk.c.w * plane.normal;
-    let w_a = add(&sums_a, disk, meet(disk, plane, rays_a), normal);
-    let w_b = add(&sums_b, disk, meet(disk, plane, rays_b), normal);
+    let w_a = add(&sums_a, &maps_a, disk, meet(disk, plane, rays_a), normal);
+    let w_b = add(&sums_b, &maps_b, disk, meet(disk, plane, rays_b), normal);
     let w = w_a + w_b;
     needed_here |= select(0u, 1u << i, max(max(w.x, w.y), max(w.z, w.w)) > 0.0);
 }
 
-fn store_pixel(column: u32, row: u32, rgb: vec3<f32>, range: f32, normal: vec4<f32>, T: f32) {
+fn store_pixel(column: u32, row: u32, rgb: vec3<f32>, T: f32) {
     if row < frame.size.y {
-        let at = row * frame.size.x + column;
-        image[at] = vec4<f32>(rgb + T * frame.background, 1.0 - T);
-        range_image[at] = range;
-        normal_image[at] = normal;
+        image[row * frame.size.x + column] = vec4<f32>(rgb + T * frame.background, 1.0 - T);
     }
 }
 
 fn store_four(column: u32, row: u32, s: Sums) {
-    store_pixel(column, row, vec3<f32>(s.r.x, s.g.x, s.b.x), s.range.x, vec4<f32>(s.nx.x, s.ny.x, s.nz.x, s.mask.x), s.T.x);
-    store_pixel(column, row + 1u, vec3<f32>(s.r.y, s.g.y, s.b.y), s.range.y, vec4<f32>(s.nx.y, s.ny.y, s.nz.y, s.mask.y), s.T.y);
-    store_pixel(column, row + 2u, vec3<f32>(s.r.z, s.g.z, s.b.z), s.range.z, vec4<f32>(s.nx.z, s.ny.z, s.nz.z, s.mask.z), s.T.z);
-    store_pixel(column, row + 3u, vec3<f32>(s.r.w, s.g.w, s.b.w), s.range.w, vec4<f32>(s.nx.w, s.ny.w, s.nz.w, s.mask.w), s.T.w);
+    store_pixel(column, row, vec3<f32>(s.r.x, s.g.x, s.b.x), s.T.x);
+    store_pixel(column, row + 1u, vec3<f32>(s.r.y, s.g.y, s.b.y), s.T.y);
+    store_pixel(column, row + 2u, vec3<f32>(s.r.z, s.g.z, s.b.z), s.T.z);
+    store_pixel(column, row + 3u, vec3<f32>(s.r.w, s.g.w, s.b.w), s.T.w);
 }
 
 @compute @workgroup_size(LANES)
@@ -140,5 +131,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     if column < frame.size.x {
         store_four(column, row, sums_a);
         store_four(column, row + 4u, sums_b);
+        store_maps(column, row, maps_a);
+        store_maps(column, row + 4u, maps_b);
     }
 }

@@ -1,6 +1,9 @@
 //@ import frame, disk, met, rays, notes, votes, exchange_disks, sums_disks
-//@ variant rasterize_disks_backward rays=disk_at_pixels notes=mask_gradients
-//@ variant trace_disks_backward rays=traced_at_pixels notes=ray_gradients
+//@ variant rasterize_disks_backward rays=from_eye+disk_at_pixels notes=straight_pixels+fixed_rays
+//@ variant trace_reflected_backward rays=from_mirror+disk_at_pixels notes=traced_pixels+fixed_rays
+//@ variant trace_refracted_backward rays=traced_at_pixels notes=traced_pixels+fixed_rays
+//@ variant trace_reflected_moving_backward rays=from_mirror+disk_at_pixels notes=traced_pixels+ray_gradients
+//@ variant trace_refracted_moving_backward rays=traced_at_pixels notes=traced_pixels+ray_gradients
 // Gradients of the blending of disks, for every intersection; see rasterize_backward.
 //
 //   v_pixels vec4: of gather_pixel_gradients [H*W*2], or of surface_compose_backward [H*W] for traced rays
@@ -108,11 +111,12 @@ fn unblend_four(four: ptr<private, Four>, noted: ptr<private, Noted>, disk: Spla
     let v_u = v_sigma * met.u;
     let v_v = v_sigma * met.v;
     let v_p_along = v_u * met.along_u + v_v * met.along_v;
-    let turn = select(zero, v_p_along / met.steep, met.is_hit);
-    let tau = turn + select(zero, v_range * met.lengths / met.steep, met.is_hit);
-    note(noted, disk, plane, met, v_u, v_v, turn);
-    let on_image_x = met.far / frame.focal.x * (v_u * disk.b.x + v_v * disk.c.x - plane.normal.x * turn);
-    let on_image_y = met.far / frame.focal.y * (v_u * disk.b.y + v_v * disk.c.y - plane.normal.y * turn);
+    let turn = select(zero, v_p_along * met.per_slope, met.is_hit);
+    let tau = turn + select(zero, v_range * met.lengths * met.per_slope, met.is_hit);
+    note(noted, disk, plane, met, rays, v_u, v_v, turn);
+    let per_focal = 1.0 / frame.focal;
+    let on_image_x = met.far * per_focal.x * (v_u * disk.b.x + v_v * disk.c.x - plane.normal.x * turn);
+    let on_image_y = met.far * per_focal.y * (v_u * disk.b.y + v_v * disk.c.y - plane.normal.y * turn);
 
     // Where the low-pass decides.
     let v_thin = select(2.0 * v_sigma, zero, met.is_hit);

@@ -3,7 +3,7 @@
 //
 //   v_image        [H*W] vec4, in: w.r.t. the picture; out: w.r.t. the straight picture
 //   v_mask_image   [H*W] w.r.t. R, the blended mask
-//   v_reflected, v_refracted  [H*W] vec4 for trace_disks_backward: (v_rgb, rem), where rem is the sum of
+//   v_reflected, v_refracted  [H*W] vec4 for rasterize_disks_backward: (v_rgb, rem), where rem is the sum of
 //                  v . (contribution) over all disks
 //   v_fresnel      [H*W] w.r.t. F
 // One thread per pixel. Twin: core/twins/src/surface.rs

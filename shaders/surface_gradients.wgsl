@@ -2,8 +2,8 @@
 // Gradients w.r.t. the plane of the water surface, through the rays that it reflects and refracts, and
 // through F (WSGS, section 4.2).
 //
-//   reflected_v, refracted_v  [H*W*2] vec4 of trace_disks_backward: gradients of origin and direction; the
-//                   former in the frame of the mirrored camera
+//   reflected_v, refracted_v  [H*W*2] vec4 of rasterize_disks_backward: gradients of origin and direction of
+//                   each ray; the former in the frame of the mirrored camera
 //   refracted_rays  [H*W*2] vec4 of surface_rays
 //   v_fresnel       [H*W] of surface_compose_backward
 //   partials        [groups] vec4: w.r.t. the normal (world axes, turned about the pivot) and the offset,

@@ -37,9 +37,9 @@ pub const DISK_GRADIENT_BYTES: u64 = 80;
 /// Bytes per pixel of disks, beside those of Gaussians. The first is the blended normal (vec4). The second is
 /// for training: its gradient, two vec4 for the backward pass, and the gradient of the mask.
 pub const DISK_PIXEL_BYTES: [u64; 2] = [16, 52];
-/// Bytes per pixel of the reflected and the refracted set of a scene with a water surface: render, blended
-/// normal and rays (two vec4) of each.
-pub const SET_PIXEL_BYTES: u64 = 2 * (RENDER_BYTES + 16 + 32);
+/// Bytes per pixel of the reflected and the refracted set of a scene with a water surface: render and rays
+/// (two vec4) of each.
+pub const SET_PIXEL_BYTES: u64 = 2 * (RENDER_BYTES + 32);
 /// Bytes per pixel of the surface: the picture (vec4), gradients of the two pictures (vec4) and of their rays
 /// (two vec4), and that of the reflectance.
 pub const SURFACE_PIXEL_BYTES: u64 = 16 + 2 * 16 + 2 * 32 + 4;

@@ -1,13 +1,16 @@
-// Disks at the eight pixels of a thread (Huang et al. 2024), for rays from the eye. Needs frame, disk, met.
+// Disks at the eight pixels of a thread (Huang et al. 2024), for rays along lines through the eye.
+// Needs frame, disk, met, and where the rays begin (from_eye.wgsl, from_mirror.wgsl).
 //
 //     t = N.m / N.d,  p = t d - m,  u = a_u.p,  v = a_v.p,  N = a_u x a_v,  d the ray of the pixel with z = 1
 //     sigma = min(u^2 + v^2, 2 |centre - pixel|^2) / 2
-// A ray that meets the plane nearer than NEAR, or not at all, sees only the second term: the low-pass.
+// A ray that meets the plane before it begins, or not at all, sees only the second term: the low-pass.
 
 // The rays of four rows of a column.
 struct Rays {
-    // 1 inside the image, else 0.
+    // 1 or 0 for no ray.
     on: vec4<f32>,
+    // A ray meets nothing before this t.
+    starts: vec4<f32>,
     pixel_y: vec4<f32>,
     y: vec4<f32>,
     lengths: vec4<f32>,
@@ -19,19 +22,18 @@ var<private> ray_x: f32;
 var<private> rays_a: Rays;
 var<private> rays_b: Rays;
 
-fn rays_of(column: u32, pixel_y: vec4<f32>) -> Rays {
+fn rays_of(column: u32, row: u32) -> Rays {
+    let pixel_y = vec4<f32>(f32(row)) + vec4<f32>(0.5, 1.5, 2.5, 3.5);
     let y = (pixel_y - frame.principal.y) / frame.focal.y;
-    let inside = (pixel_y < vec4<f32>(f32(frame.size.y))) & vec4<bool>(column < frame.size.x);
-    let on = select(vec4<f32>(0.0), vec4<f32>(1.0), inside);
-    return Rays(on, pixel_y, y, sqrt(1.0 + ray_x * ray_x + y * y));
+    let begin = begin_of(column, row);
+    return Rays(begin.on, begin.starts, pixel_y, y, sqrt(1.0 + ray_x * ray_x + y * y));
 }
 
 fn begin_rays(column: u32, row: u32) {
     pixel_x = f32(column) + 0.5;
     ray_x = (pixel_x - frame.principal.x) / frame.focal.x;
-    let pixel_y = vec4<f32>(f32(row)) + vec4<f32>(0.5, 1.5, 2.5, 3.5);
-    rays_a = rays_of(column, pixel_y);
-    rays_b = rays_of(column, pixel_y + 4.0);
+    rays_a = rays_of(column, row);
+    rays_b = rays_of(column, row + 4u);
 }
 
 // What is the same at all pixels of a column.
@@ -56,11 +58,11 @@ fn plane_of(disk: Splat) -> Plane {
 
 fn meet(disk: Splat, plane: Plane, rays: Rays) -> Met {
     let slope = plane.along.x + plane.normal.y * rays.y;
-    let steep = select(slope, vec4<f32>(1e-30), abs(slope) < vec4<f32>(1e-30));
-    let t = plane.at_centre.x / steep;
+    let per_slope = 1.0 / select(slope, vec4<f32>(1e-30), abs(slope) < vec4<f32>(1e-30));
+    let t = plane.at_centre.x * per_slope;
     let along_u = plane.along.y + disk.b.y * rays.y;
     let along_v = plane.along.z + disk.c.y * rays.y;
     let u = t * along_u - plane.at_centre.y;
     let v = t * along_v - plane.at_centre.z;
-    return met_of(disk, u, v, t, t > vec4<f32>(NEAR), steep, along_u, along_v, t, rays.lengths, rays.pixel_y);
+    return met_of(disk, u, v, t, t > rays.starts, per_slope, along_u, along_v, t, rays.lengths, rays.pixel_y);
 }

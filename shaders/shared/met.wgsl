@@ -5,8 +5,8 @@ struct Met {
     u: vec4<f32>,
     v: vec4<f32>,
     t: vec4<f32>,
-    // N.d, never 0; a_u.d and a_v.d.
-    steep: vec4<f32>,
+    // 1 / N.d, finite; a_u.d and a_v.d.
+    per_slope: vec4<f32>,
     along_u: vec4<f32>,
     along_v: vec4<f32>,
     // Twice sigma.
@@ -21,7 +21,7 @@ struct Met {
     dy: vec4<f32>,
 }
 
-fn met_of(disk: Splat, u: vec4<f32>, v: vec4<f32>, t: vec4<f32>, is_ahead: vec4<bool>, steep: vec4<f32>,
+fn met_of(disk: Splat, u: vec4<f32>, v: vec4<f32>, t: vec4<f32>, is_ahead: vec4<bool>, per_slope: vec4<f32>,
         along_u: vec4<f32>, along_v: vec4<f32>, far: vec4<f32>, lengths: vec4<f32>, pixel_y: vec4<f32>) -> Met {
     let solid = u * u + v * v;
     let dx = disk.a.w - pixel_x;
@@ -30,6 +30,6 @@ fn met_of(disk: Splat, u: vec4<f32>, v: vec4<f32>, t: vec4<f32>, is_ahead: vec4<
     // False for numbers that are not finite.
     let is_hit = is_ahead & (solid <= thin);
     let zero = vec4<f32>(0.0);
-    return Met(select(zero, u, is_hit), select(zero, v, is_hit), select(zero, t, is_hit), steep, along_u, along_v,
+    return Met(select(zero, u, is_hit), select(zero, v, is_hit), select(zero, t, is_hit), per_slope, along_u, along_v,
         select(thin, solid, is_hit), is_hit, select(zero, far, is_hit), lengths, dx, dy);
 }

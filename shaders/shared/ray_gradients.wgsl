@@ -1,23 +1,12 @@
 // What the backward pass of disks adds up for each ray: the gradients of its origin and its direction. Needs
-// disk, met and the name v_pixels. Masks, normals and ranges belong to disks that are seen straight.
+// disk, met and rays.
 //
 // p = o + t d - m and t = N.(m - o) / N.d, so that the gradient of o is v_u a_u + v_v a_v - turn N, with turn
-// = (v_u a_u + v_v a_v).d / N.d, and that of d is t times as much. The low-pass has no part in it.
+// = (v_u a_u + v_v a_v).d / N.d, and that of d is t times as much, with t from o
+// on along the unit ray d. The low-pass has no part in it.
 
 // [H*W*2] vec4: gradient of the origin, gradient of the direction.
 @group(0) @binding(9) var<storage, read_write> v_rays: array<vec4<f32>>;
-
-fn v_of(at: u32) -> vec4<f32> {
-    return v_pixels[at];
-}
-
-fn v_surface_of(at: u32) -> vec4<f32> {
-    return vec4<f32>(0.0);
-}
-
-fn v_mask_of(at: u32) -> f32 {
-    return 0.0;
-}
 
 struct Noted {
     ox: vec4<f32>,
@@ -28,17 +17,18 @@ struct Noted {
     dz: vec4<f32>,
 }
 
-fn note(noted: ptr<private, Noted>, disk: Splat, plane: Plane, met: Met, v_u: vec4<f32>, v_v: vec4<f32>,
-        turn: vec4<f32>) {
+fn note(noted: ptr<private, Noted>, disk: Splat, plane: Plane, met: Met, rays: Rays, v_u: vec4<f32>,
+        v_v: vec4<f32>, turn: vec4<f32>) {
     let x = v_u * disk.b.x + v_v * disk.c.x - turn * plane.normal.x;
     let y = v_u * disk.b.y + v_v * disk.c.y - turn * plane.normal.y;
     let z = v_u * disk.b.z + v_v * disk.c.z - turn * plane.normal.z;
+    let t = (met.t - rays.starts) * rays.lengths;
     (*noted).ox += x;
     (*noted).oy += y;
     (*noted).oz += z;
-    (*noted).dx += met.t * x;
-    (*noted).dy += met.t * y;
-    (*noted).dz += met.t * z;
+    (*noted).dx += t * x;
+    (*noted).dy += t * y;
+    (*noted).dz += t * z;
 }
 
 fn store_ray(column: u32, row: u32, origin: vec3<f32>, direction: vec3<f32>) {

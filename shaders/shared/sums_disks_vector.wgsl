@@ -1,4 +1,4 @@
-// As sums_vector.wgsl, for disks.
+// As sums_vector.wgsl, for disks. Needs the name HAS_MAPS.
 
 var<private> mine_sums: Splat;
 
@@ -14,8 +14,14 @@ fn give_sums(lane: u32, i: u32, sums: Splat) {
     mine_sums.a = select(mine_sums.a, over_lanes(sums.a), keep);
     mine_sums.b = select(mine_sums.b, over_lanes(sums.b), keep);
     mine_sums.c = select(mine_sums.c, over_lanes(sums.c), keep);
-    mine_sums.d = select(mine_sums.d, over_lanes(sums.d), keep);
-    mine_sums.e = select(mine_sums.e, over_lanes(sums.e), keep);
+    if HAS_MAPS {
+        mine_sums.d = select(mine_sums.d, over_lanes(sums.d), keep);
+        mine_sums.e = select(mine_sums.e, over_lanes(sums.e), keep);
+    } else {
+        let others = over_lanes(vec4<f32>(sums.e.xyz, sums.d.w));
+        mine_sums.d.w = select(mine_sums.d.w, others.w, lane == i);
+        mine_sums.e = select(mine_sums.e, vec4<f32>(others.xyz, 0.0), keep);
+    }
 }
 
 // Called for both halves of a batch; the second writes.

@@ -1,4 +1,4 @@
-// Disks at the eight pixels of a thread, for rays that begin at the water surface. Needs frame, disk, met.
+// Disks at the eight pixels of a thread, for rays that the water surface refracts. Needs frame, disk, met.
 //
 //     t = N.(m - o) / N.d,  p = o + t d - m,  u = a_u.p,  v = a_v.p,  N = a_u x a_v,  |d| = 1
 //     sigma = min(u^2 + v^2, 2 |centre - pixel|^2) / 2, with the centre where it appears on the image
@@ -9,6 +9,9 @@
 // The rays of four rows of a column.
 struct Rays {
     on: vec4<f32>,
+    // As in disk_at_pixels.wgsl.
+    starts: vec4<f32>,
+    lengths: vec4<f32>,
     pixel_y: vec4<f32>,
     ox: vec4<f32>,
     oy: vec4<f32>,
@@ -43,6 +46,8 @@ fn rays_of(column: u32, row: u32) -> Rays {
     let s = ray_of(column, row + 3u);
     return Rays(
         vec4<f32>(p.origin.w, q.origin.w, r.origin.w, s.origin.w),
+        vec4<f32>(0.0),
+        vec4<f32>(1.0),
         vec4<f32>(f32(row)) + vec4<f32>(0.5, 1.5, 2.5, 3.5),
         vec4<f32>(p.origin.x, q.origin.x, r.origin.x, s.origin.x),
         vec4<f32>(p.origin.y, q.origin.y, r.origin.y, s.origin.y),
@@ -70,15 +75,15 @@ fn plane_of(disk: Splat) -> Plane {
 fn meet(disk: Splat, plane: Plane, rays: Rays) -> Met {
     let n = plane.normal;
     let slope = n.x * rays.dx + n.y * rays.dy + n.z * rays.dz;
-    let steep = select(slope, vec4<f32>(1e-30), abs(slope) < vec4<f32>(1e-30));
+    let per_slope = 1.0 / select(slope, vec4<f32>(1e-30), abs(slope) < vec4<f32>(1e-30));
     let ox = rays.ox - disk.a.x;
     let oy = rays.oy - disk.a.y;
     let oz = rays.oz - disk.a.z;
-    let t = -(n.x * ox + n.y * oy + n.z * oz) / steep;
+    let t = -(n.x * ox + n.y * oy + n.z * oz) * per_slope;
     let along_u = disk.b.x * rays.dx + disk.b.y * rays.dy + disk.b.z * rays.dz;
     let along_v = disk.c.x * rays.dx + disk.c.y * rays.dy + disk.c.z * rays.dz;
     let u = t * along_u + (disk.b.x * ox + disk.b.y * oy + disk.b.z * oz);
     let v = t * along_v + (disk.c.x * ox + disk.c.y * oy + disk.c.z * oz);
-    return met_of(disk, u, v, t, t > vec4<f32>(0.0), steep, along_u, along_v, rays.oz + t * rays.dz, vec4<f32>(1.0),
+    return met_of(disk, u, v, t, t > rays.starts, per_slope, along_u, along_v, rays.oz + t * rays.dz, rays.lengths,
         rays.pixel_y);
 }

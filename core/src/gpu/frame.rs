@@ -24,12 +24,15 @@ pub enum SurfaceRays {
 pub struct FrameTargets {
     /// `[H*W]` vec4: rgb, alpha.
     pub image: wgpu::Buffer,
-    /// `[H*W]`.
+    /// `[H*W]`. Not written for rays at a water surface.
     pub range_image: wgpu::Buffer,
-    /// `[H*W]` vec4 of a frame of disks: blended normal, camera axes, towards the camera.
+    /// `[H*W]` vec4 of a frame of disks that are seen from the eye: blended normal, camera axes, towards the
+    /// camera.
     pub normal_image: Option<wgpu::Buffer>,
     /// `[H*W*2]` vec4 of a frame of rays at a water surface (`surface_rays.wgsl`).
     pub rays: Option<wgpu::Buffer>,
+    /// `[tiles]` of such a frame: which tiles have a ray (`surface_tiles.wgsl`).
+    pub tile_rays: Option<wgpu::Buffer>,
     /// `[tiles+1]` first and last of the sorted intersections.
     pub ranges: wgpu::Buffer,
     /// `[tiles]`.
@@ -222,7 +225,7 @@ impl Frame {
         buffers.extend(&self.disks);
         if let Some(targets) = &self.targets {
             buffers.extend(&targets.normal_image);
-            buffers.extend(&targets.rays);
+            buffers.extend(targets.rays.iter().chain(&targets.tile_rays));
             buffers.extend([&targets.image, &targets.range_image, &targets.ranges, &targets.tile_ends]);
         }
         buffers
@@ -261,12 +264,16 @@ impl Frame {
         self.targets = Some(FrameTargets {
             image: gpu.buffer("image", pixels * 16)?,
             range_image: gpu.buffer("range image", pixels * 4)?,
-            normal_image: match &self.disks {
-                Some(_) => Some(gpu.buffer("normal image", pixels * 16)?),
-                None => None,
+            normal_image: match (&self.disks, &self.surface) {
+                (Some(_), None) => Some(gpu.buffer("normal image", pixels * 16)?),
+                _ => None,
             },
             rays: match &self.surface {
                 Some(_) => Some(gpu.buffer("rays at the surface", pixels * 32)?),
+                None => None,
+            },
+            tile_rays: match &self.surface {
+                Some(_) => Some(gpu.buffer("tiles with rays at the surface", tiles * 4)?),
                 None => None,
             },
             ranges: gpu.buffer("tile ranges", (tiles + 1) * 8)?,
@@ -308,16 +315,19 @@ impl Frame {
             ("visible_from_slot", &self.visible_from_slot),
             ("ranges", &targets.ranges),
             ("image", &targets.image),
-            ("range_image", &targets.range_image),
             ("tile_ends", &targets.tile_ends),
         ];
-        let of_disks = self.disks.iter().map(|disks| ("disks", disks));
-        bound.extend(of_disks.chain(targets.normal_image.iter().map(|image| ("normal_image", image))));
-        bound.extend(targets.rays.iter().map(|rays| ("rays", rays)));
-        let kernel = match (&self.disks, &self.surface) {
+        bound.extend(self.disks.iter().map(|disks| ("disks", disks)));
+        match &targets.rays {
+            Some(rays) => bound.push(("rays", rays)),
+            None => bound.push(("range_image", &targets.range_image)),
+        }
+        bound.extend(targets.normal_image.iter().map(|image| ("normal_image", image)));
+        let kernel = match (&self.disks, self.rays()) {
             (None, _) => "rasterize_forward",
             (Some(_), None) => "rasterize_disks",
-            (Some(_), Some(_)) => "trace_disks",
+            (Some(_), Some(SurfaceRays::Reflected)) => "trace_reflected",
+            (Some(_), Some(SurfaceRays::Refracted)) => "trace_refracted",
         };
         recorder.dispatch(kernel, Size::Groups(view.end_tile - view.first_tile), &bound)
     }
@@ -428,11 +438,20 @@ impl Frame {
         self.depth_sort.record(recorder, &self.counters, DEPTH_BITS, groups)?;
         let per_visible = Size::Indirect(&self.args, counter::ARGS_VISIBLE);
         let order = self.depth_order();
-        recorder.dispatch(
-            "intersect_count",
-            per_visible,
-            &[frame, counters, ("projected", &self.projected), ("order", order), ("counts", &self.offsets)],
-        )?;
+        let (count, emit) = match self.surface {
+            None => ("intersect_count", "intersect_emit"),
+            Some(_) => ("intersect_count_at_surface", "intersect_emit_at_surface"),
+        };
+        let tile_rays = targets.tile_rays.as_ref().map(|tile_rays| ("tile_rays", tile_rays));
+        let mut bound = vec![
+            frame,
+            counters,
+            ("projected", &self.projected),
+            ("order", order),
+            ("counts", &self.offsets),
+        ];
+        bound.extend(tile_rays);
+        recorder.dispatch(count, per_visible, &bound)?;
         let chunks = Size::Indirect(&self.args, counter::ARGS_VISIBLE_SCAN);
         self.offset_scan.record(recorder, &self.counters, &self.offsets, chunks)?;
         recorder.dispatch(
@@ -440,21 +459,19 @@ impl Frame {
             Size::Groups(1),
             &[frame, ("sums", self.offset_scan.sums()), counters, ("args", &self.args)],
         )?;
-        recorder.dispatch(
-            "intersect_emit",
-            per_visible,
-            &[
-                frame,
-                counters,
-                ("projected", &self.projected),
-                ("order", order),
-                ("offsets", &self.offsets),
-                ("tile_keys", &self.tile_sort.keys[0]),
-                ("slots", &self.tile_sort.values[0]),
-                ("visible_from_slot", &self.visible_from_slot),
-                ("segments", &self.segments),
-            ],
-        )?;
+        let mut bound = vec![
+            frame,
+            counters,
+            ("projected", &self.projected),
+            ("order", order),
+            ("offsets", &self.offsets),
+            ("tile_keys", &self.tile_sort.keys[0]),
+            ("slots", &self.tile_sort.values[0]),
+            ("visible_from_slot", &self.visible_from_slot),
+            ("segments", &self.segments),
+        ];
+        bound.extend(tile_rays);
+        recorder.dispatch(emit, per_visible, &bound)?;
         let tiles = view.tile_count();
         let groups =
             [counter::ARGS_TILE_SORT, counter::ARGS_TILE_SCAN].map(|slot| Size::Indirect(&self.args, slot));

@@ -44,8 +44,9 @@ pub struct TracedBuffers<'a> {
     /// `[H*W]` vec4: gradient with respect to the blended colour, and its sum over all disks
     /// (`surface_compose_backward.wgsl`).
     pub v_pixels: &'a wgpu::Buffer,
-    /// `[H*W*2]` vec4, written here: gradients of the origin and the direction of each ray.
-    pub v_rays: &'a wgpu::Buffer,
+    /// `[H*W*2]` vec4, written here: gradients of the origin and the direction of each ray. Not made for a
+    /// surface that is not trained.
+    pub v_rays: Option<&'a wgpu::Buffer>,
 }
 
 /// The kernel that takes the step of the Gaussians of `frame`.
@@ -251,23 +252,26 @@ fn record_trace(
     let (Some(disks), Some(rays)) = (&frame.disks, &targets.rays) else {
         return Err(CoreError::Gpu("rays at a water surface need a frame of them".into()));
     };
-    recorder.dispatch(
-        "trace_disks_backward",
-        Size::Groups(band.end_tile - band.first_tile),
-        &[
-            ("frame", &frame.uniform),
-            ("projected", &frame.projected),
-            ("disks", disks),
-            ("slots", frame.sorted_slots(band.tile_count())),
-            ("visible_from_slot", &frame.visible_from_slot),
-            ("ranges", &targets.ranges),
-            ("tile_ends", &targets.tile_ends),
-            ("v_pixels", traced.v_pixels),
-            ("rays", rays),
-            ("v_rays", traced.v_rays),
-            ("slot_gradients", buffers.slot_gradients),
-        ],
-    )
+    let mut bound = vec![
+        ("frame", &frame.uniform),
+        ("projected", &frame.projected),
+        ("disks", disks),
+        ("slots", frame.sorted_slots(band.tile_count())),
+        ("visible_from_slot", &frame.visible_from_slot),
+        ("ranges", &targets.ranges),
+        ("tile_ends", &targets.tile_ends),
+        ("v_pixels", traced.v_pixels),
+        ("rays", rays),
+        ("slot_gradients", buffers.slot_gradients),
+    ];
+    bound.extend(traced.v_rays.map(|v_rays| ("v_rays", v_rays)));
+    let kernel = match (frame.rays(), traced.v_rays.is_some()) {
+        (Some(SurfaceRays::Reflected), false) => "trace_reflected_backward",
+        (Some(SurfaceRays::Reflected), true) => "trace_reflected_moving_backward",
+        (_, false) => "trace_refracted_backward",
+        (_, true) => "trace_refracted_moving_backward",
+    };
+    recorder.dispatch(kernel, Size::Groups(band.end_tile - band.first_tile), &bound)
 }
 
 fn record_step(

@@ -398,17 +398,18 @@ fn traced_pictures_match_the_twin() {
             let seen = Seen::new(&gpu, &pool, sets(605, 250, 1));
             for set in [1, 2] {
                 let Traced { rays, twin, decided, .. } = seen.traced(set);
-                let (image, range) = (seen.views[set].image(), seen.views[set].range_image());
+                let image = seen.views[set].image();
                 let share = decided.iter().filter(|decided| **decided).count() as f64 / decided.len() as f64;
                 assert!(share > 0.5, "{}, set {set}: {share} of the pixels are decided", pool.name);
                 let mut shown = 0;
                 for i in (0..decided.len()).filter(|&i| decided[i]) {
                     shown += usize::from(rays[i].nearest.is_finite() && twin.raster.alpha[i] > 0.1);
                     let pixel = image[i].map(f64::from);
-                    let pairs = (0..3)
-                        .map(|c| (pixel[c], twin.raster.rgb[i][c], 1e-4))
-                        .chain([(pixel[3], twin.raster.alpha[i], 1e-4)])
-                        .chain([(f64::from(range[i]), twin.raster.range[i], 5e-4)]);
+                    let pairs = (0..3).map(|c| (pixel[c], twin.raster.rgb[i][c], 1e-4)).chain([(
+                        pixel[3],
+                        twin.raster.alpha[i],
+                        1e-4,
+                    )]);
                     for (n, (kernel, twin, tolerance)) in pairs.enumerate() {
                         assert!(
                             (kernel - twin).abs() <= tolerance,
@@ -418,6 +419,35 @@ fn traced_pictures_match_the_twin() {
                     }
                 }
                 assert!(shown > 150, "{}, set {set}: {shown} pixels show disks", pool.name);
+            }
+        }
+    }
+}
+
+#[test]
+fn only_tiles_with_a_ray_have_lists() {
+    for gpu in layouts() {
+        for pool in Pool::all() {
+            let seen = Seen::new(&gpu, &pool, sets(606, 250, 1));
+            let rays = seen.rays();
+            let size = seen.views[0].uniform.size;
+            let tiles = seen.views[0].uniform.tiles;
+            let mut has_ray = vec![false; (tiles[0] * tiles[1]) as usize];
+            for i in (0..seen.pixels() as u32).filter(|&i| rays.is_hit(i as usize)) {
+                has_ray[(i / size[0] / gpu.tile() * tiles[0] + i % size[0] / gpu.tile()) as usize] = true;
+            }
+            assert!(has_ray.contains(&true), "{}: no tile has a ray", pool.name);
+            for view in &seen.views[1..] {
+                let targets = view.frame.targets().unwrap();
+                let flags = targets.tile_rays.as_ref().unwrap();
+                let flags: Vec<u32> = gpu.read(flags, 0, has_ray.len()).unwrap();
+                assert_eq!(flags, has_ray.iter().map(|&has| u32::from(has)).collect::<Vec<_>>());
+                let ranges: Vec<[u32; 2]> = gpu.read(&targets.ranges, 0, has_ray.len()).unwrap();
+                for (tile, [first, last]) in ranges.iter().enumerate() {
+                    let most = if has_ray[tile] { u32::MAX } else { 0 };
+                    assert!(last - first <= most, "{}: tile {tile} lists {first}..{last}", pool.name);
+                }
+                assert!(ranges.iter().any(|[first, last]| last > first), "{}: no list", pool.name);
             }
         }
     }

@@ -48,7 +48,7 @@ fn through_the_surface(seen: &Seen, v: &[[f32; 4]]) {
     let v_mask = storage(gpu, &vec![f32::NAN; v.len()]);
     for TracedBuffers { v_pixels, v_rays } in seen.device.traced() {
         poison(gpu, v_pixels);
-        poison(gpu, v_rays);
+        poison(gpu, v_rays.unwrap());
     }
     let mut recorder = Recorder::new(gpu);
     let of = SetGradients { v_image: &v_image, v_mask: &v_mask };
@@ -98,7 +98,7 @@ fn backward(seen: &Seen, set: usize) -> Vec<[f32; 20]> {
 /// The gradients of the rays of a set as the kernel wrote them.
 fn rays_of(seen: &Seen, set: usize) -> Vec<RayGradient> {
     let rows: Vec<[[f32; 4]; 2]> =
-        seen.gpu().read(seen.device.traced()[set - 1].v_rays, 0, seen.pixels()).unwrap();
+        seen.gpu().read(seen.device.traced()[set - 1].v_rays.unwrap(), 0, seen.pixels()).unwrap();
     let vector = |v: &[f32; 4]| DVec3::new(v[0].into(), v[1].into(), v[2].into());
     rows.iter().map(|row| RayGradient { origin: vector(&row[0]), direction: vector(&row[1]) }).collect()
 }
@@ -264,7 +264,7 @@ fn gradients_at_the_surface_are_the_same_in_bands() {
             let view = &seen.views[set];
             let (whole, rays) = (view.parameter_gradients(), rays_of(&seen, set));
             let of = seen.device.traced()[set - 1];
-            poison(&gpu, of.v_rays);
+            poison(&gpu, of.v_rays.unwrap());
             let (frame, blocks, uniform) = (&view.frame, &view.blocks, &view.uniform);
             let buffers = Buffers::new(view, &gradients_only());
             let mut recorder = Recorder::new(&gpu);
@@ -363,11 +363,11 @@ fn a_spoilt_gradient_or_a_short_list_moves_no_plane() {
     assert_eq!(seen.device.read(&gpu).unwrap(), before);
     gpu.write(&seen.views[0].frame.counters, overflow, &[0_u32]);
     let hit = (0..seen.pixels()).find(|&i| seen.rays().is_hit(i)).unwrap();
-    gpu.write(seen.device.traced()[1].v_rays, 32 * hit as u64, &[f32::NAN; 8]);
+    gpu.write(seen.device.traced()[1].v_rays.unwrap(), 32 * hit as u64, &[f32::NAN; 8]);
     record_step(&seen, 1, [0.01; 2]);
     assert_eq!(seen.device.read(&gpu).unwrap(), before);
     assert_eq!(seen.device.steps_left_out(&gpu).unwrap(), 1);
-    gpu.write(seen.device.traced()[1].v_rays, 32 * hit as u64, &[0.0_f32; 8]);
+    gpu.write(seen.device.traced()[1].v_rays.unwrap(), 32 * hit as u64, &[0.0_f32; 8]);
     record_step(&seen, 1, [0.01; 2]);
     assert_ne!(seen.device.read(&gpu).unwrap(), before);
 }

@@ -138,27 +138,35 @@ impl DeviceSurface {
     pub fn traced(&self) -> [super::super::TracedBuffers<'_>; 2] {
         let maps = &self.maps;
         [(&maps.v_reflected, &maps.reflected_v), (&maps.v_refracted, &maps.refracted_v)]
-            .map(|(v_pixels, v_rays)| super::super::TracedBuffers { v_pixels, v_rays })
+            .map(|(v_pixels, v_rays)| super::super::TracedBuffers { v_pixels, v_rays: Some(v_rays) })
     }
 
-    /// Records the rays at the surface, of pixels that the straight picture does not cover.
+    /// Records the rays at the surface, of pixels that the straight picture does not cover, and their tiles.
     ///
     /// # Errors
     /// When a kernel does not compile or a frame is not what it should be.
     pub fn record_rays(&self, recorder: &mut Recorder<'_>, frames: Frames<'_>, pixels: u32) -> Result<()> {
         let (reflected, refracted) = (rays_of(frames.reflected)?, rays_of(frames.refracted)?);
+        let frame = ("frame", &frames.straight.uniform);
         recorder.dispatch(
             "surface_rays",
             Size::Items(pixels, 64),
             &[
-                ("frame", &frames.straight.uniform),
+                frame,
                 ("surface", &self.plane),
                 ("image", &frames.straight.targets()?.image),
                 ("normal_image", masks_of(frames.straight)?),
                 ("reflected_rays", reflected),
                 ("refracted_rays", refracted),
             ],
-        )
+        )?;
+        for side in [frames.reflected, frames.refracted] {
+            let Some(tile_rays) = &side.targets()?.tile_rays else { continue };
+            let tiles = Size::Items((tile_rays.size() / 4) as u32, 64);
+            let bound = [frame, ("rays", rays_of(side)?), ("tile_rays", tile_rays)];
+            recorder.dispatch("surface_tiles", tiles, &bound)?;
+        }
+        Ok(())
     }
 
     /// Records the picture from those of the three sets.

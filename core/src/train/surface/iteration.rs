@@ -8,7 +8,9 @@ use crate::Result;
 use crate::config::{SurfaceJoin, SurfaceRefine};
 use crate::gpu::{FrameUniform, Gpu, MaskLossUniform, Recorder, StepUniform, SurfaceStepUniform};
 use crate::memory::BATCH;
-use crate::train::{BackwardBuffers, DiskMaps, Progress, Trainer, record_backward, record_backward_in_bands};
+use crate::train::{
+    BackwardBuffers, DiskMaps, Progress, TracedBuffers, Trainer, record_backward, record_backward_in_bands,
+};
 
 /// Adam of the surface: every iteration has a gradient, so these are the usual rates of decay.
 const BETA1: f64 = 0.9;
@@ -228,16 +230,28 @@ impl SurfaceTrainer {
         // Backward.
         end(&self.straight, gpu, recorder, &whole, &straight, None)?;
         if all {
-            let traced = self.device.traced();
+            let moves = self.moves_surface(iteration);
+            let traced = self
+                .device
+                .traced()
+                .map(|traced| TracedBuffers { v_rays: traced.v_rays.filter(|_| moves), ..traced });
             for ((set, bands), traced) in
                 [&self.reflected, &self.refracted].into_iter().zip(&sides).zip(traced)
             {
                 let v_image = loss.v_image()?;
                 end(set, gpu, recorder, &whole, bands, Some((v_image, traced)))?;
             }
-            self.record_surface_step(gpu, recorder, iteration, pixels)?;
+            if moves {
+                self.record_surface_step(gpu, recorder, iteration, pixels)?;
+            }
         }
         Ok(())
+    }
+
+    /// Whether an iteration takes a step of the surface.
+    fn moves_surface(&self, iteration: u32) -> bool {
+        let until = share_of(self.straight.config.iterations, self.config.refine_until);
+        self.config.refine != SurfaceRefine::Fixed && iteration < until
     }
 
     fn record_surface_step(
@@ -247,10 +261,6 @@ impl SurfaceTrainer {
         iteration: u32,
         pixels: u32,
     ) -> Result<()> {
-        let until = share_of(self.straight.config.iterations, self.config.refine_until);
-        if self.config.refine == SurfaceRefine::Fixed || iteration >= until {
-            return Ok(());
-        }
         let steps = f64::from(iteration - self.from + 1);
         let tilts = self.config.refine == SurfaceRefine::Tilt;
         let step = SurfaceStepUniform {
@@ -310,7 +320,7 @@ fn end(
     recorder: &mut Recorder<'_>,
     whole: &FrameUniform,
     bands: &[FrameUniform],
-    traced: Option<(&wgpu::Buffer, crate::train::TracedBuffers<'_>)>,
+    traced: Option<(&wgpu::Buffer, TracedBuffers<'_>)>,
 ) -> Result<()> {
     let (v_image, v_range) = match traced {
         // Not read.

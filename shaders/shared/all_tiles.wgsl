@@ -1,0 +1,5 @@
+// Whether a tile has a list: all do.
+
+fn has_list(tile: u32) -> bool {
+    return true;
+}
