@@ -5,7 +5,7 @@
 # The scenes are not part of the repository: FATHOM_SCENES is their folder (default ../shared/scenes). A
 # figure with a missing scene is reported as not checked. The script fails only if a figure misses its bound.
 # One figure: `scripts/accept.sh NAME`; the names are the functions below. All figures take hours on two
-# cores. FATHOM_ACCEPT_SEEDS="2 3" runs only these seeds for the figures of open water.
+# cores. FATHOM_ACCEPT_SEEDS="2 3" runs only these seeds for the figures of open water and of depth.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -816,6 +816,26 @@ cost() { # iterations
     awk -v a="${times[0]}" -v b="${times[1]}" 'BEGIN { exit !(a <= 3 * b) }' ||
         miss "a step of wsgs takes more than 3 times as long as one of 3dgs: ${times[*]} ms"
 }
+# Depth of disks against that of 3D Gaussians on the wreck.
+disk_depth() {
+    have sesa-wreck/truth/depth_m.npz || return 0
+    local method seed name error errors medians=() settings=(--max-resolution 240 --iterations 3000 --max-gaussians 80000)
+    for method in splats 2dgs; do
+        errors=()
+        for seed in ${FATHOM_ACCEPT_SEEDS:-1 2 3}; do
+            name="depth-$method-$seed"
+            train "$name" "$scenes/sesa-wreck" --method "$method" --seed "$seed" "${settings[@]}" &&
+                error=$(scripts/depth_error.py "$fathom" "$out/$name" "$scenes/sesa-wreck") ||
+                { miss "no depth of the wreck with --method $method"; return 0; }
+            errors+=("$error")
+        done
+        medians+=("$(printf '%s\n' "${errors[@]}" | awk '{ sum += $1 } END { printf "%.4f", sum / NR }')")
+        row "sesa-wreck/$method" "fathom train sesa-wreck --method $method ${settings[*]}" \
+            "median depth error ${errors[*]} m by seed" "depth_error_m=${medians[-1]}"
+    done
+    awk -v disks="${medians[1]}" -v splats="${medians[0]}" 'BEGIN { exit !(disks <= 0.8 * splats) }' ||
+        miss "disks have a median depth error of ${medians[1]} m, 3D Gaussians of ${medians[0]} m: not 20 % less"
+}
 mean_of() { # path of a key, JSON files
     python3 -c 'import json, sys
 values = [json.load(open(path))[sys.argv[1]] for path in sys.argv[2:]]
@@ -842,7 +862,7 @@ demo() {
 
 all='plans plan_scale merge_scale partitions readers demo fox other_programs speed step vksplat quality_for_time reef_360 fox_moments reef wreck water water_long sparse_waters other_waters viewer_colours reef_water
 open_water fox_long wreck_full
-twelve_million parallel drivers memory_1m wsgs'
+twelve_million parallel drivers memory_1m wsgs disk_depth'
 for figure in ${1:-$all}; do
     "$figure"
 done
