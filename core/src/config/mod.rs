@@ -116,7 +116,13 @@ impl JobConfig {
             Preset::Surface => Method::Surface,
             _ => Method::default(),
         };
-        Self { preset, method, water, ..Self::default() }.with_shape()
+        let mut partition = PartitionConfig::default();
+        if preset == Preset::Surface {
+            // Partitions keep the reflected set of the coarse model, and what it lacks ends in the refracted
+            // set. A pool of 4 m in 2x2 had 25.7 dB without its water instead of 22.3.
+            partition.global_iterations = 1.0;
+        }
+        Self { preset, method, water, partition, ..Self::default() }.with_shape()
     }
 
     /// Sets what the method says about its Gaussians.
@@ -225,7 +231,8 @@ pub struct PartitionConfig {
     pub visibility: f64,
     /// Factor on `visibility` for edge partitions. Default 0.3 (SMP-UWGS eq. 3).
     pub visibility_edge_factor: f64,
-    /// Iterations of the global stage as a share of the job's. Default 0.25 (docs/decisions/0028).
+    /// Iterations of the global stage as a share of the job's. Through a water surface, partitions keep the
+    /// reflected set of its model. Default 0.25 (docs/decisions/0028).
     pub global_iterations: f64,
     /// Minimum iterations of the global stage, never more than those of the job. Default 1000 (ours). On fox
     /// in 2x2, 1000 iterations lose 0.52 dB; a coarse model of 1000 iterations instead of 250 regains 0.41 dB
