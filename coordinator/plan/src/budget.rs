@@ -213,5 +213,8 @@ mod tests {
         let in_air = global_stage(&in_air, 240, &pictures(3, 240, 180), &[]);
         assert_eq!(in_air.forecast.parts.pixels, 240 * 180 * 92);
         assert_eq!(stage.forecast.parts.per_visible, 750_000 * 80, "without points all may be seen");
+        let at_surface = JobConfig::of_preset(fathom_core::config::Preset::Surface);
+        let at_surface = global_stage(&at_surface, 240, &pictures(3, 240, 180), &[]);
+        assert_eq!(at_surface.iterations, 12_000, "partitions keep its reflected set");
     }
 }
