@@ -232,7 +232,7 @@ pub struct PartitionConfig {
     /// Factor on `visibility` for edge partitions. Default 0.3 (SMP-UWGS eq. 3).
     pub visibility_edge_factor: f64,
     /// Iterations of the global stage as a share of the job's. Through a water surface, partitions keep the
-    /// reflected set of its model. Default 0.25 (docs/decisions/0028).
+    /// reflected set of the coarse model. Default 0.25 (docs/decisions/0028).
     pub global_iterations: f64,
     /// Minimum iterations of the global stage, never more than those of the job. Default 1000 (ours). On fox
     /// in 2x2, 1000 iterations lose 0.52 dB; a coarse model of 1000 iterations instead of 250 regains 0.41 dB

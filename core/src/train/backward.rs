@@ -44,7 +44,7 @@ pub struct TracedBuffers<'a> {
     /// `[H*W]` vec4: gradient with respect to the blended colour, and its sum over all disks
     /// (`surface_compose_backward.wgsl`).
     pub v_pixels: &'a wgpu::Buffer,
-    /// `[H*W*2]` vec4, written here: gradients of the origin and the direction of each ray. Not made for a
+    /// `[H*W*2]` vec4, written here: gradients of the origin and the direction of each ray. None for a
     /// surface that is not trained.
     pub v_rays: Option<&'a wgpu::Buffer>,
 }

@@ -427,7 +427,10 @@ fn traced_pictures_match_the_twin() {
 #[test]
 fn only_tiles_with_a_ray_have_lists() {
     for gpu in layouts() {
-        for pool in Pool::all() {
+        // The sky above the horizon has no rays.
+        let horizon = Pool::new("horizon", DVec3::new(0.1, 1.7, 1.5), true, true);
+        let mut without = 0;
+        for pool in Pool::all().into_iter().chain([horizon]) {
             let seen = Seen::new(&gpu, &pool, sets(606, 250, 1));
             let rays = seen.rays();
             let size = seen.views[0].uniform.size;
@@ -437,6 +440,7 @@ fn only_tiles_with_a_ray_have_lists() {
                 has_ray[(i / size[0] / gpu.tile() * tiles[0] + i % size[0] / gpu.tile()) as usize] = true;
             }
             assert!(has_ray.contains(&true), "{}: no tile has a ray", pool.name);
+            without += has_ray.iter().filter(|&&has| !has).count();
             for view in &seen.views[1..] {
                 let targets = view.frame.targets().unwrap();
                 let flags = targets.tile_rays.as_ref().unwrap();
@@ -450,6 +454,7 @@ fn only_tiles_with_a_ray_have_lists() {
                 assert!(ranges.iter().any(|[first, last]| last > first), "{}: no list", pool.name);
             }
         }
+        assert!(without > 0, "every tile of every pool has a ray");
     }
 }
 
