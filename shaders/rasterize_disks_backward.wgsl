@@ -119,7 +119,7 @@ fn unblend_four(four: ptr<private, Four>, noted: ptr<private, Noted>, disk: Spla
     let on_image_y = met.far * per_focal.y * (v_u * disk.b.y + v_v * disk.c.y - plane.normal.y * turn);
 
     // Where the low-pass decides.
-    let v_thin = select(2.0 * v_sigma, zero, met.is_hit);
+    let v_thin = select((1.0 / DISK_BLUR) * v_sigma, zero, met.is_hit);
     let v_x = v_thin * met.dx;
     let v_y = v_thin * met.dy;
 

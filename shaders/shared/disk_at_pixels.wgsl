@@ -2,7 +2,7 @@
 // Needs frame, disk, met, and where the rays begin (from_eye.wgsl, from_mirror.wgsl).
 //
 //     t = N.m / N.d,  p = t d - m,  u = a_u.p,  v = a_v.p,  N = a_u x a_v,  d the ray of the pixel with z = 1
-//     sigma = min(u^2 + v^2, 2 |centre - pixel|^2) / 2
+//     sigma = min(u^2 + v^2, |centre - pixel|^2 / DISK_BLUR) / 2
 // A ray that meets the plane before it begins, or not at all, sees only the second term: the low-pass.
 
 // The rays of four rows of a column.

@@ -50,6 +50,8 @@ fn direction_of(frame: Frame, i: u32) -> vec3<f32> {
 const NEAR: f32 = 0.01;
 // Low-pass of the projection, pixel^2 (3DGS): a Gaussian is never thinner than about a pixel.
 const BLUR: f32 = 0.3;
+// That of disks. 2DGS has 0.5, which blurs disks of about a pixel (bench/history.jsonl).
+const DISK_BLUR: f32 = 0.2;
 // Alpha below one step of 8-bit colour is not blended.
 const MIN_ALPHA: f32 = 1.0 / 255.0;
 // No single Gaussian is fully opaque, so that division by 1 - alpha is safe.

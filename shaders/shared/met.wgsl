@@ -26,7 +26,7 @@ fn met_of(disk: Splat, u: vec4<f32>, v: vec4<f32>, t: vec4<f32>, is_ahead: vec4<
     let solid = u * u + v * v;
     let dx = disk.a.w - pixel_x;
     let dy = disk.b.w - pixel_y;
-    let thin = 2.0 * (dx * dx + dy * dy);
+    let thin = (1.0 / DISK_BLUR) * (dx * dx + dy * dy);
     // False for numbers that are not finite.
     let is_hit = is_ahead & (solid <= thin);
     let zero = vec4<f32>(0.0);

@@ -16,7 +16,7 @@ struct Bound {
 // moderate size.
 const LEAST_IN_FRONT: f32 = 0.01;
 // Standard deviation of the low-pass of disks, pixels.
-const LOW_PASS: f32 = 0.70710678;
+const LOW_PASS: f32 = sqrt(DISK_BLUR);
 
 // Share of its distance that the scale of a disk may have for all of it to be bent nearly as its centre is.
 const SMALL: f32 = 0.03;

@@ -11,9 +11,9 @@ use fathom_core::gpu::{Gpu, Recorder, counter};
 use fathom_core::rng::{Stream, uniform_at};
 use fathom_core::train::{BackwardBuffers, DiskBuffers, DiskMaps, LEAST_ALPHA, record_backward};
 use fathom_twins::{
-    Disk, DiskGradient, DiskRaster, DiskRasterGradients, DiskRay, Gaussians64, Raster, RasterRules, Sight,
-    Splat, TileLists, bounds_of, depth_order, intersect, normal_consistency, pinhole_rays, project_disks,
-    project_disks_backward, samples, trace_backward, trace_forward,
+    DISK_BLUR, Disk, DiskGradient, DiskRaster, DiskRasterGradients, DiskRay, Gaussians64, Raster,
+    RasterRules, Sight, Splat, TileLists, bounds_of, depth_order, intersect, normal_consistency,
+    pinhole_rays, project_disks, project_disks_backward, samples, trace_backward, trace_forward,
 };
 use glam::DVec3;
 
@@ -100,7 +100,7 @@ fn needed_at(
         let p = origin + t * direction - disk.centre;
         let solid = a_u.dot(p).powi(2) + a_v.dot(p).powi(2);
         let delta = [disk.centre2d[0] - f64::from(x) - 0.5, disk.centre2d[1] - f64::from(y) - 0.5];
-        let thin = 2.0 * (delta[0].powi(2) + delta[1].powi(2));
+        let thin = (delta[0].powi(2) + delta[1].powi(2)) / DISK_BLUR;
         let is_hit = t > nearest && solid <= thin;
         let full = disk.bound.opacity * (-0.5 * if is_hit { solid } else { thin }).exp();
         let near = |value: f64, edge: f64| (value / edge - 1.0).abs() < 5e-3;

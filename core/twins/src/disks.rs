@@ -6,7 +6,7 @@
 //!
 //! ```text
 //! t = N.(m - o) / (N.d),   p = o + t d - m,   u = a_u.p,   v = a_v.p
-//! sigma = min(u^2 + v^2, 2 |centre - pixel|^2) / 2        (eq. 11: never thinner than about a pixel)
+//! sigma = min(u^2 + v^2, |centre - pixel|^2 / DISK_BLUR) / 2   (eq. 11: never thinner than about a pixel)
 //! range = t |d|, or |m| where the second term decides
 //! ```
 //!
@@ -24,8 +24,8 @@ use glam::{DMat3, DVec2, DVec3};
 use super::project_backward::quat_backward;
 use super::project_forward::{active_coeffs, norm, rotation_matrix, sigmoid};
 use super::{
-    Gaussians64, NEAR, Raster, RasterGradients, RasterRules, Sight, Splat, TILE, TileLists, sh_colour,
-    sh_colour_backward,
+    DISK_BLUR, Gaussians64, NEAR, Raster, RasterGradients, RasterRules, Sight, Splat, TILE, TileLists,
+    sh_colour, sh_colour_backward,
 };
 use fathom_core::scene::{PinholeCamera, Pose};
 
@@ -142,8 +142,7 @@ fn project(
     } else {
         outline(m, half, reach, camera).or_else(|| {
             // Only the circle of the low-pass is left.
-            let low_pass = LOW_PASS * LOW_PASS;
-            is_beside(m, half, reach, camera).then_some((DVec2::ZERO, [low_pass, 0.0, low_pass]))
+            is_beside(m, half, reach, camera).then_some((DVec2::ZERO, [DISK_BLUR, 0.0, DISK_BLUR]))
         })
     };
     let (offset, [xx, xy, yy]) = ellipse.unwrap_or_else(|| whole_image(camera, centre2d, reach));
@@ -214,7 +213,7 @@ fn outline(m: DVec3, half: [DVec3; 2], reach: f64, camera: &PinholeCamera) -> Op
     let [p, q] = sheared;
     // Of one standard deviation: `reach` of them are the outline.
     let from_centre = offset / reach.max(LEAST_REACH);
-    let pad = (LOW_PASS + offset.length() / reach.max(LEAST_REACH)).powi(2);
+    let pad = (DISK_BLUR.sqrt() + offset.length() / reach.max(LEAST_REACH)).powi(2);
     Some((
         offset,
         [
@@ -230,8 +229,6 @@ fn outline(m: DVec3, half: [DVec3; 2], reach: f64, camera: &PinholeCamera) -> Op
 const LEAST_IN_FRONT: f64 = 1e-2;
 /// Opacities of almost 1/255 reach nowhere; no division by that.
 const LEAST_REACH: f64 = 1e-3;
-/// Standard deviation of the low-pass, pixels: sigma = |centre - pixel|^2.
-const LOW_PASS: f64 = std::f64::consts::FRAC_1_SQRT_2;
 
 /// A rendered view of disks.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -281,7 +278,7 @@ pub(super) fn contribution(
     let p = ray.origin + t * ray.direction - disk.centre;
     let (u, v) = (a_u.dot(p), a_v.dot(p));
     let delta = DVec2::from(disk.centre2d) - DVec2::from(pixel);
-    let (solid, thin) = (u * u + v * v, 2.0 * delta.length_squared());
+    let (solid, thin) = (u * u + v * v, delta.length_squared() / DISK_BLUR);
     let is_hit = t > ray.nearest && solid <= thin;
     let falloff = (-0.5 * if is_hit { solid } else { thin }).exp();
     let full = disk.bound.opacity * falloff;
@@ -512,7 +509,7 @@ fn add(
             depth * (v_p - slope).truncate() / DVec2::new(camera.fx, camera.fy)
         }
         None => {
-            let v_centre = 2.0 * v.sigma * (DVec2::from(disk.centre2d) - DVec2::from(pixel));
+            let v_centre = v.sigma / DISK_BLUR * (DVec2::from(disk.centre2d) - DVec2::from(pixel));
             sum.centre2d[0] += v_centre.x;
             sum.centre2d[1] += v_centre.y;
             sum.range += v.range;

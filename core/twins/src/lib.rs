@@ -75,6 +75,8 @@ pub use water::{
 pub const NEAR: f64 = 0.01;
 /// Variance of the low-pass filter on every projected Gaussian, px^2 (3DGS).
 pub const BLUR: f64 = 0.3;
+/// Variance of the low-pass of disks, px^2. 2DGS has 0.5, which blurs disks of about a pixel.
+pub const DISK_BLUR: f64 = 0.2;
 /// Side of a tile, pixels.
 pub const TILE: u32 = 16;
 

@@ -6,7 +6,7 @@
 
 use glam::{DMat3, DVec2, DVec3};
 
-use crate::NEAR;
+use crate::{DISK_BLUR, NEAR};
 use fathom_core::scene::{PinholeCamera, Pose};
 use fathom_core::surface::Surface;
 use fathom_core::surface::optics::{Crossing, Motion};
@@ -127,7 +127,7 @@ impl Sight {
             let moved = self.moved(m, axis);
             focal / q.z * (moved.truncate() - moved.z / q.z * q.truncate())
         });
-        let pad = (std::f64::consts::FRAC_1_SQRT_2 + 0.5 / reach.max(1e-3)).powi(2);
+        let pad = (DISK_BLUR.sqrt() + 0.5 / reach.max(1e-3)).powi(2);
         let [xx, xy, yy] = [a.x * a.x + b.x * b.x + pad, a.x * a.y + b.x * b.y, a.y * a.y + b.y * b.y + pad];
         let scale = half[0].length().max(half[1].length());
         let size = scale / (q.length() + (m - q).length());

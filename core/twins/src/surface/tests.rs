@@ -3,8 +3,9 @@
 use super::*;
 use crate::finite_differences::{assert_close, derivative};
 use crate::{
-    Disk, DiskGradient, DiskRasterGradients, Gaussians64, RasterGradients, RasterRules, TileLists, bounds_of,
-    intersect, pinhole_rays, project_seen, project_seen_backward, trace_backward_along, trace_forward,
+    DISK_BLUR, Disk, DiskGradient, DiskRasterGradients, Gaussians64, RasterGradients, RasterRules, TileLists,
+    bounds_of, intersect, pinhole_rays, project_seen, project_seen_backward, trace_backward_along,
+    trace_forward,
 };
 use fathom_core::rng::{Stream, uniform_at};
 use fathom_core::surface::WATER;
@@ -97,7 +98,7 @@ impl Traced {
                 let t = normal.dot(disk.centre - ray.origin) / normal.dot(ray.direction);
                 let p = ray.origin + t * ray.direction - disk.centre;
                 let solid = a_u.dot(p).powi(2) + a_v.dot(p).powi(2);
-                let thin = 2.0 * (0..2).map(|c| (disk.centre2d[c] - at[c]).powi(2)).sum::<f64>();
+                let thin = (0..2).map(|c| (disk.centre2d[c] - at[c]).powi(2)).sum::<f64>() / DISK_BLUR;
                 t < 0.05 || solid > 0.95 * thin - 0.02
             })
     }
