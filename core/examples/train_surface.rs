@@ -158,6 +158,15 @@ impl Shown {
     }
 }
 
+/// Mean PSNR of whole pictures.
+fn entire_db(shown: &mut Shown, views: &InMemory) -> Fallible<f64> {
+    let mut sum = 0.0;
+    for (view, photograph) in views.views.iter().zip(&views.images) {
+        sum += psnr(&shown.each(view)?[0], photograph);
+    }
+    Ok(sum / views.views.len() as f64)
+}
+
 fn save(folder: &Path, name: &str, picture: &PackedImage) -> Fallible<()> {
     std::fs::create_dir_all(folder)?;
     let bytes = picture.pixels.iter().flat_map(|pixel| pixel.to_le_bytes()[..3].to_vec()).collect();
@@ -258,6 +267,7 @@ fn main() -> Fallible<()> {
         }
     }
     let [entire, region, dry, oil, dry_entire] = sums.map(|sum| sum / test.views.len() as f64);
+    let trained = entire_db(&mut shown, &photographs(&scene, &data, false)?)?;
     let plane: Option<Value> = std::fs::read(folder.join("truth/surface.json"))
         .ok()
         .and_then(|bytes| serde_json::from_slice(&bytes).ok());
@@ -276,6 +286,7 @@ fn main() -> Fallible<()> {
             "dry_db": dry,
             "oil_db": oil,
             "dry_entire_db": dry_entire,
+            "trained_entire_db": trained,
             "offset_error": off,
             "refined": settings.refine != SurfaceRefine::Fixed,
             "prior_seconds": prior_seconds,

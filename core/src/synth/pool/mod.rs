@@ -38,8 +38,9 @@ use hall::Basin;
 
 /// Refractive index of the `oil` truth.
 pub const OIL: f64 = 1.46;
-/// Rays per pixel and axis.
-const SUPERSAMPLE: u32 = 2;
+/// Rays per pixel: the points of Hammersley. No two share a column or a row, so an edge along an axis covers
+/// a pixel in steps of a 16th. With 2x2 rays, exact pictures were only 36 dB from the photographs.
+const RAYS: u32 = 16;
 /// Rings of cameras around a middle: height above the water and distance from the middle, metres.
 const RINGS: [[f64; 2]; 3] = [[0.8, 1.7], [1.3, 1.5], [1.9, 1.15]];
 /// Length of basin that one middle serves, metres.
@@ -274,21 +275,21 @@ impl Photograph {
             pictures: std::array::from_fn(|_| picture()),
             region: GrayImage::new(width, height),
         };
-        let (origin, rays) = (pose.centre(), SUPERSAMPLE * SUPERSAMPLE);
+        let origin = pose.centre();
         for y in 0..height {
             for x in 0..width {
                 let (mut seen, mut sums, mut wet) = (DVec3::ZERO, [DVec3::ZERO; 4], 0);
-                for sub in 0..rays {
-                    let offset = |k: u32| (f64::from(k) + 0.5) / f64::from(SUPERSAMPLE);
-                    let pixel =
-                        [f64::from(x) + offset(sub % SUPERSAMPLE), f64::from(y) + offset(sub / SUPERSAMPLE)];
+                for sub in 0..RAYS {
+                    let offset = |k: u32| (f64::from(k) + 0.5) / f64::from(RAYS);
+                    let mirrored = sub.reverse_bits() >> (32 - RAYS.ilog2());
+                    let pixel = [f64::from(x) + offset(sub), f64::from(y) + offset(mirrored)];
                     let ray = Ray { origin, direction: pixel_ray(camera, pose, pixel) };
                     let shown = shown(world, water, &ray, options.seed);
                     seen += shown.seen;
                     sums.iter_mut().zip(shown.truth).for_each(|(sum, one)| *sum += one);
                     wet += u32::from(shown.is_wet);
                 }
-                let samples = f64::from(rays);
+                let samples = f64::from(RAYS);
                 let seen = seen / samples;
                 let error = normal_numbers(options.seed, 40_000 + view as u32, y * width + x);
                 let sigma = NOISE * DVec3::new(seen.x.sqrt(), seen.y.sqrt(), seen.z.sqrt());
@@ -299,7 +300,7 @@ impl Photograph {
                 for (picture, mean) in truth.pictures.iter_mut().zip(means) {
                     picture.put_pixel(x, y, encode(mean));
                 }
-                truth.region.put_pixel(x, y, Luma([if wet == rays { 255 } else { 0 }]));
+                truth.region.put_pixel(x, y, Luma([if wet == RAYS { 255 } else { 0 }]));
             }
         }
         Self { pixels, truth: view.is_multiple_of(TRUTH_EVERY).then_some(truth) }
