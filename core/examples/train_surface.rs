@@ -135,6 +135,10 @@ fn inside(mut picture: PackedImage, region: Option<&PackedImage>) -> PackedImage
     picture
 }
 
+fn picture(rendered: &Rendered) -> PackedImage {
+    quantised(rendered.width, rendered.height, &rendered.rgb)
+}
+
 /// What the method shows: wet, dry, with oil.
 enum Shown {
     Plain(Box<Renderer>),
@@ -142,17 +146,21 @@ enum Shown {
 }
 
 impl Shown {
+    fn wet(&mut self, view: &TrainView) -> Fallible<PackedImage> {
+        Ok(picture(&match self {
+            Self::Plain(renderer) => renderer.render(&view.camera, &view.pose, [0.0; 3])?,
+            Self::Surface(all) => all.0.render(&view.camera, &view.pose)?,
+        }))
+    }
+
     fn each(&mut self, view: &TrainView) -> Fallible<[PackedImage; 3]> {
-        let picture = |rendered: Rendered| quantised(rendered.width, rendered.height, &rendered.rgb);
+        let wet = self.wet(view)?;
         Ok(match self {
-            Self::Plain(renderer) => {
-                let wet = picture(renderer.render(&view.camera, &view.pose, [0.0; 3])?);
-                [wet.clone(), wet.clone(), wet]
-            }
+            Self::Plain(_) => [wet.clone(), wet.clone(), wet],
             Self::Surface(all) => [
-                picture(all.0.render(&view.camera, &view.pose)?),
-                picture(all.1.render(&view.camera, &view.pose, [0.0; 3])?),
-                picture(all.2.render(&view.camera, &view.pose)?),
+                wet,
+                picture(&all.1.render(&view.camera, &view.pose, [0.0; 3])?),
+                picture(&all.2.render(&view.camera, &view.pose)?),
             ],
         })
     }
@@ -162,7 +170,7 @@ impl Shown {
 fn entire_db(shown: &mut Shown, views: &InMemory) -> Fallible<f64> {
     let mut sum = 0.0;
     for (view, photograph) in views.views.iter().zip(&views.images) {
-        sum += psnr(&shown.each(view)?[0], photograph);
+        sum += psnr(&shown.wet(view)?, photograph);
     }
     Ok(sum / views.views.len() as f64)
 }
